@@ -54,7 +54,7 @@ def test_two_values_are_told_apart_by_as_many_digits_as_that_takes(limit: float,
 def test_what_is_beyond_a_limit_says_so_without_a_row_of_digits(limit: float, more: float, unit: str) -> None:
     said = beyond("x", limit + more, limit, unit)
     assert said.startswith("x ")
-    assert " beyond its limit " in said
+    assert " beyond the limit of " in said
     numbers = re.findall(r"-?[0-9][0-9.]*(?:e[-+][0-9]+)?", said)
     assert all(len(number.lstrip("-").split("e")[0].replace(".", "").lstrip("0")) <= 6 for number in numbers)
     assert numbers[0] != numbers[-1] or "is " in said.split(" beyond")[0]
@@ -63,10 +63,10 @@ def test_what_is_beyond_a_limit_says_so_without_a_row_of_digits(limit: float, mo
 @pytest.mark.parametrize(
     ("value", "limit", "unit", "said"),
     [
-        (-0.17000001, -0.17, "m", "p is 10 nm beyond its limit -170 mm"),
-        (0.8500001, 0.85, "rad", "p is 100 nrad beyond its limit 48.7014°"),
-        (0.17001, 0.17, "m", "p 170.01 mm is beyond its limit 170 mm"),
-        (0.50000005, 0.5, "m/s", "p is 50 nm/s beyond its limit 500 mm/s"),
+        (-0.17000001, -0.17, "m", "p is 10 nm beyond the limit of -170 mm"),
+        (0.8500001, 0.85, "rad", "p is 100 nrad beyond the limit of 48.7014°"),
+        (0.17001, 0.17, "m", "p 170.01 mm is beyond the limit of 170 mm"),
+        (0.50000005, 0.5, "m/s", "p is 50 nm/s beyond the limit of 500 mm/s"),
     ],
 )
 def test_what_is_hardly_beyond_says_by_how_much(value: float, limit: float, unit: str, said: str) -> None:

@@ -106,7 +106,7 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if self.method == 0:
-            raise ValueError("method 0 is no homing: leave the table out where the encoder is absolute")
+            raise ValueError("method 0 means no homing: omit the table if the encoder is absolute")
 
 
 class ObjectWrite(Struct, frozen=True, forbid_unknown_fields=True):
@@ -128,7 +128,7 @@ class ObjectWrite(Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         low = -(1 << self.bits - 1) if self.signed else 0
         if not low <= self.value < low + (1 << self.bits):
-            raise ValueError(f"value {self.value} is no {self.type}")
+            raise ValueError(f"value {self.value} is not a valid {self.type}")
 
     @property
     def bits(self) -> int:

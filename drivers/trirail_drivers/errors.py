@@ -45,7 +45,9 @@ class DriveTimeout(DriveError):
     """A drive did not answer in time."""
 
     def __init__(self, drive: str, waiting_for: str, seconds: float) -> None:
-        super().__init__(f"drive {drive}: no {waiting_for} within {seconds:g} s; is it powered and on this bus?")
+        super().__init__(
+            f"drive {drive}: no {waiting_for} within {seconds:g} s; check that the drive is powered and on this bus"
+        )
         self.drive = drive
 
 

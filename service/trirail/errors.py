@@ -96,11 +96,11 @@ class RefusalCode(StrEnum):
     # The message.
     MALFORMED = (
         "malformed",
-        "not a message of its kind: a field is missing, unknown or impossible",
+        "the message is not valid: a field is missing, unknown or has an impossible value",
         "send what the schema allows",
     )
     TOO_LARGE = "too_large", "exceeds the maximum size", "send a smaller message"
-    UNKNOWN_ENCODING = "unknown_encoding", "neither JSON nor msgpack", "name the encoding, or none for JSON"
+    UNKNOWN_ENCODING = "unknown_encoding", "neither JSON nor msgpack", "state the encoding, or omit it for JSON"
     UNKNOWN_KEY = (
         "unknown_key",
         "not a key of the table; Zenoh does not deliver it, so a query on it ends without a reply",
@@ -109,13 +109,13 @@ class RefusalCode(StrEnum):
     WILDCARD = "wildcard", "a key for more than one robot or user", "name one robot and one user"
     BAD_NAME = (
         "bad_name",
-        "a name of other characters than letters, digits, - and _, or a pose that reads as a quantity: 5mm",
+        "characters other than letters, digits, - and _ in the name, or a pose named as a quantity: 5mm",
         "use another name",
     )
-    UNKNOWN_COMMAND = "unknown_command", "no such command", "send one of the commands in the message"
-    DUPLICATE_ID = "duplicate_id", "the goal's id is used already", "give every goal its own id, or none"
-    UNKNOWN_FRAME = "unknown_frame", "no tool or frame of that name in [frames]", "use one of those in info"
-    UNKNOWN_POSE = "unknown_pose", "no pose of that name", "use one of those in poses, or teach it"
+    UNKNOWN_COMMAND = "unknown_command", "unknown command", "send one of the commands in the message"
+    DUPLICATE_ID = "duplicate_id", "the goal's id has already been used", "give every goal its own id, or none"
+    UNKNOWN_FRAME = "unknown_frame", "no tool or frame of that name in [frames]", "use a name that info lists"
+    UNKNOWN_POSE = "unknown_pose", "no pose of that name", "use a name that poses lists, or teach the pose"
     CONFIGURED_POSE = (
         "configured_pose",
         "a pose of [poses] in the configuration cannot be taught or removed",
@@ -125,40 +125,44 @@ class RefusalCode(StrEnum):
     # The sender.
     NOT_ALLOWED = (
         "not_allowed",
-        "the user has no role that allows it",
+        "the role of the user does not allow the request",
         "ask for another role in [zenoh.users] of the robot's configuration",
     )
 
     LEASED = "leased", "another user holds the lease", "wait until it is free, or take it over"
     NO_LEASE = (
         "no_lease",
-        "nobody holds the lease: there is none to release, or this robot requires one to move",
+        "no user holds the lease: there is no lease to release, or this robot requires a lease for motion",
         "send acquire",
     )
-    LEASE_OVER = "lease_over", "the lease was released, taken over, or not renewed in time", "acquire a new one"
+    LEASE_OVER = "lease_over", "the lease was released, taken over, or not renewed in time", "acquire a new lease"
 
     # The robot's mode.
-    NOT_ENABLED = "not_enabled", "the drives have no power yet", "send enable, and wait for it"
+    NOT_ENABLED = "not_enabled", "the drives have no power yet", "send enable, and wait until the mode is holding"
     NOT_HOMED = "not_homed", "the positions of the sliders are unknown", "send home"
     HOMING = "homing", "the robot is homing", "wait until the mode is holding"
     MOVING = "moving", "the robot moves, or a goal is paused", "send stop first"
-    STOPPING = "stopping", "the robot is still stopping", "send it again when it is at rest"
+    STOPPING = "stopping", "the robot is still stopping", "send the request again when the robot is at rest"
     FAULT = "fault", "the robot is in fault", "remove the cause, then send reset and enable"
     NO_FAULT = "no_fault", "there is no fault to reset", "none is needed"
     NO_GOAL = "no_goal", "no such goal is active", "none is needed"
     NOT_PAUSED = "not_paused", "no goal is paused", "send a goal"
     NOTHING_TO_HOME = "nothing_to_home", "the encoders are absolute", "none is needed"
-    NOT_AT_REST = "not_at_rest", "a slider is being moved from outside", "enable when it is at rest"
+    NOT_AT_REST = (
+        "not_at_rest",
+        "a slider is being moved by an external force",
+        "send enable when the slider is at rest",
+    )
 
     # The path to the goal.
     OUT_OF_WORKSPACE = (
         "out_of_workspace",
-        "the goal or its path exceeds a limit, or leads further beyond one",
+        "the goal or its path exceeds a limit, or leads further beyond a limit",
         "choose a goal inside; from beyond a limit every goal that leads back is accepted, at low speed",
     )
     SINGULAR = (
         "singular",
-        "the robot is singular there, or its slider positions belong to no pose",
+        "the path passes a singular pose, or the slider positions do not correspond to any pose",
         "choose another path; move the sliders",
     )
     ABOVE_LIMIT = "above_limit", "a jog, or the goal's own limit, exceeds the robot's limit", "lower it"
@@ -176,19 +180,19 @@ class RefusalCode(StrEnum):
     NO_PLAN = (
         "no_plan",
         "the planner found no motion to the goal from the current one",
-        "send it again when the robot holds",
+        "send the goal again when the mode is holding",
     )
     PLANNER_LOST = (
         "planner_lost",
         "the planner process has ended; motions in progress continue",
-        "send it again: the planner is restarted",
+        "send the goal again: the planner is restarted",
     )
     NO_VELOCITY = "no_velocity", "the jog has no velocity", "set a velocity"
-    AT_LIMIT = "at_limit", "the jog ended at a limit", "start a new jog away from it"
+    AT_LIMIT = "at_limit", "the jog ended at a limit", "start a new jog away from the limit"
     JOG_OVER = (
         "jog_over",
         "the jog or track is over: not renewed in time, paused, stopped or refused",
-        "start a new one",
+        "start a new jog or track",
     )
     BAD_MARK = (
         "bad_mark",
@@ -198,7 +202,7 @@ class RefusalCode(StrEnum):
     UNKNOWN_OUTPUT = (
         "unknown_output",
         "no output or input of that name in the configuration",
-        "use one of those in info",
+        "use a name that info lists",
     )
     WRONG_TIME = (
         "wrong_time",
@@ -207,17 +211,17 @@ class RefusalCode(StrEnum):
     )
 
     # Time, load and execution.
-    EXPIRED = "expired", "the goal could not start in time", "send it again, or with a longer valid_for"
-    QUEUE_FULL = "queue_full", "the goal queue is full", "send it when a goal has ended"
+    EXPIRED = "expired", "the goal could not start in time", "send the goal again, or with a longer valid_for"
+    QUEUE_FULL = "queue_full", "the goal queue is full", "send the goal when another goal has ended"
     BUSY = "busy", "too many messages, goals or commands are waiting", "send fewer, or more slowly"
-    STOPPED = "stopped", "a stop came before the goal started", "send it again"
+    STOPPED = "stopped", "a stop arrived before the goal started", "send the goal again"
     FAULTED = (
         "faulted",
-        "a fault came before the goal started",
+        "a fault occurred before the goal started",
         "remove the cause, send reset and enable, then the goal",
     )
     FAILED = "failed", "the command was accepted but could not be carried out", "see the message"
-    TIMEOUT = "timeout", "not carried out in time", "check the state, then send it again"
+    TIMEOUT = "timeout", "the request was not carried out in time", "check the state, then send the request again"
     ENDED = "ended", "the service has ended", "start it"
     INTERNAL = "internal", "an internal error of the service", "please report it"
     OTHER = "other", "a code that is unknown to this client; no service sends it", "see the message"

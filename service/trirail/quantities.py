@@ -38,9 +38,10 @@ def beyond(name: str, value: float, limit: float, unit: str) -> str:
         smaller = _SMALLER.get(base, ((f" {base}" if base else "", 1.0),))
         unit_name, factor = next((each for each in smaller if abs(value - limit) * each[1] >= 1.0), smaller[-1])
         return (
-            f"{name} is {abs(value - limit) * factor:.3g}{unit_name}{per}{rate} beyond its limit {worded(limit, unit)}"
+            f"{name} is {abs(value - limit) * factor:.3g}{unit_name}{per}{rate} beyond the limit of "
+            f"{worded(limit, unit)}"
         )
-    return f"{name} {worded(value, unit)} is beyond its limit {worded(limit, unit)}"
+    return f"{name} {worded(value, unit)} is beyond the limit of {worded(limit, unit)}"
 
 
 _WHOLE_TOLERANCE: Final = 1e-6

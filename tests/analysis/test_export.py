@@ -97,7 +97,7 @@ def test_every_number_comes_back(suffix: str, recording: Recording, tmp_path: Pa
 def test_a_file_is_never_written_over_and_its_name_says_its_format(recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("mine")
-    with pytest.raises(ServiceError, match="exists already: name another file"):
+    with pytest.raises(ServiceError, match="already exists: choose another file"):
         export.write(recording, path)
     assert path.read_text() == "mine"
     with pytest.raises(ServiceError, match=r"must end in .csv, .parquet or .npy"):
@@ -138,7 +138,9 @@ def test_columns_are_names_of_fields_or_words_of_these(recording: Recording) -> 
     assert recordings.table(recording, ["error", "following_error"]).num_columns == 4
     with pytest.raises(ServiceError, match=r"no column poze: did you mean pose\?"):
         recordings.table(recording, ["poze"])
-    with pytest.raises(ServiceError, match="no column torque: expected one of, or a word in: wall, mode, cycle"):
+    with pytest.raises(
+        ServiceError, match="no column torque: use one of these names, or a word of one: wall, mode, cycle"
+    ):
         recordings.table(recording, ["torque"])
 
 
@@ -161,5 +163,5 @@ def test_a_goal_lasts_from_where_it_was_given_until_it_ended(recording: Recordin
     part = told.part(goal="g-17")
     assert (part.records["cycle"][0], part.records["cycle"][-1], part.t[-1]) == (200, 500, 0.5)
     assert told._replace(events=[]).part(goal="g-17").t[-1] == recording.t[-1]
-    with pytest.raises(ServiceError, match="no goal g-18 in it; the newest: g-17"):
+    with pytest.raises(ServiceError, match="the recording has no goal g-18; its newest goals: g-17"):
         told.part(goal="g-18")

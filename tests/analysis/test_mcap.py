@@ -116,7 +116,7 @@ def test_velocities_are_those_of_the_positions(recording: Recording) -> None:
 def test_a_file_is_never_written_over(recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / "session.mcap"
     path.write_text("mine")
-    with pytest.raises(ServiceError, match="exists already: name another file"):
+    with pytest.raises(ServiceError, match="already exists: choose another file"):
         mcap.write(recording, path)
     assert path.read_text() == "mine"
     with pytest.raises(ServiceError, match="needs the configuration"):
@@ -151,5 +151,5 @@ def test_urdf_goes_to_a_file_or_to_the_terminal(tmp_path: Path, capsys: pytest.C
     assert recording_commands.urdf(out=path) == 0
     assert recording_commands.urdf() == 0
     assert capsys.readouterr().out.endswith(path.read_text(encoding="utf-8"))
-    with pytest.raises(ServiceError, match="exists already"):
+    with pytest.raises(ServiceError, match="already exists"):
         recording_commands.urdf(out=path)

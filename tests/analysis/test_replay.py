@@ -217,13 +217,13 @@ def test_what_begins_in_motion_is_refused(recording: Recording, config: Config) 
     moving = int(np.flatnonzero(np.any(recording.records["commanded_velocity"] != 0.0, axis=1))[0])
     late = recording._replace(records=recording.records[moving:])
     # What is advised must be possible: the file of a recorder that was restarted has none before it.
-    with pytest.raises(ServiceError, match=r"in mode moving; a replay needs .* begins disabled.*restarted.*report"):
+    with pytest.raises(ServiceError, match=r"in mode moving; a replay needs .* mode disabled.*restarted.*report"):
         replay_session(late, config, simulated=False)
 
 
 def test_another_rate_is_refused(recording: Recording, config: Config) -> None:
     slower = msgspec.structs.replace(config, loop=msgspec.structs.replace(config.loop, rate_hz=500))
-    with pytest.raises(ServiceError, match="500 Hz, but the recording has 1000 cycles a second"):
+    with pytest.raises(ServiceError, match="500 Hz, but the recording has 1000 cycles per second"):
         replay_session(recording, slower, simulated=True)
 
 

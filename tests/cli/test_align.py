@@ -95,7 +95,7 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     [
         ("echo nonsense", "expected"),
         ("true", "has ended with exit code 0"),
-        ("sleep 60", "no line in 0.05 s: does it flush what it prints"),
+        ("sleep 60", "no line in 0.05 s; check that it flushes"),
         ("/no/such/program", "cannot run"),
         ("""echo '{"left": [1, "a"]}'""", "expected"),
     ],
@@ -186,7 +186,7 @@ def test_pictures_that_are_not_taken_anew_or_are_none_are_named(
     (tmp_path / "left.png").write_bytes(b"cut off")
     with (
         mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _),
-        pytest.raises(TrirailError, match=r"write it as \.left\.png and rename it"),
+        pytest.raises(TrirailError, match=r"write it as \.left\.png, then rename it"),
     ):
         look()
 
@@ -247,7 +247,7 @@ def test_one_camera_that_shows_several_marks_is_opened_once_and_read_once_a_look
             seen = look()
             assert seen["a"] == pytest.approx((85.0 + 2.5 * n, 120.0), abs=0.1)
             assert seen["b"] == pytest.approx((235.0 + 2.5 * n, 95.0), abs=0.1)
-        with pytest.raises(TrirailError, match="gives no picture any more"):
+        with pytest.raises(TrirailError, match="no longer delivers pictures"):
             look()
 
 
@@ -260,7 +260,7 @@ def test_one_camera_that_shows_several_marks_is_opened_once_and_read_once_a_look
         ({"camera": ("a=0",), "window": ("a=0,0,9",)}, "expected MARK=U,V,WIDTH,HEIGHT"),
         ({"camera": ("a=0",), "window": ("a=0,0,-9,9",)}, "expected MARK=U,V,WIDTH,HEIGHT"),
         ({"camera": ("a",)}, "expected MARK=DEVICE"),
-        ({"program": "true", "window": ("a=0,0,9,9",)}, "--window is for pictures"),
+        ({"program": "true", "window": ("a=0,0,9,9",)}, "--window is only for pictures"),
     ],
 )
 def test_what_cannot_be_meant_of_a_source_is_said(options: dict[str, Any], words: str) -> None:
@@ -316,7 +316,7 @@ def test_marks_of_what_opencv_opens_are_found_in_pictures_that_are_newer_than_th
     with mark_source.cameras({"m": str(tmp_path / "film_%02d.png")}, MarkShape("disc", 50.0), 0.0) as (look, _):
         assert look() == {"m": pytest.approx((185.0, 120.0), abs=0.05)}
         assert look() == {"m": pytest.approx((235.0, 120.0), abs=0.05)}
-        with pytest.raises(TrirailError, match="gives no picture any more"):
+        with pytest.raises(TrirailError, match="no longer delivers pictures"):
             look()
 
 
@@ -329,4 +329,4 @@ def test_a_camera_that_is_not_there_is_named() -> None:
 @pytest.mark.parametrize("given", [(), ("--program", "true", "--pictures", "x")], ids=["no source", "two of them"])
 def test_one_source_of_marks_is_wanted(given: tuple[str, ...], tmp_path: Path) -> None:
     done = trirail("align", "calibrate", tmp_path / "camera.json", *given, code=1)
-    assert "give one of them" in done.stderr
+    assert "give exactly one of" in done.stderr

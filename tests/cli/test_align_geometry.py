@@ -131,7 +131,7 @@ def test_what_is_not_the_configuration_of_the_service_is_refused_before_a_move(
     other.write_text(text, encoding="utf-8")
     done = warm.trirail("align", "geometry", other, *rest)
     assert done.returncode == 1
-    assert "not that with which the service runs" in " ".join(done.stderr.split())
+    assert "differs from that of the running service" in " ".join(done.stderr.split())
 
 
 @pytest.mark.slow

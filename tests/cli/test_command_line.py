@@ -158,33 +158,37 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [
-        ("goto ../../etc", 1, "pose '../../etc' is not a valid name; use letters, digits, - and _, at most 64"),
+        ("goto ../../etc", 1, "pose '../../etc' is not a valid name; use at most 64 letters, digits, - and _"),
         ("goto a/b", 1, "letters, digits, - and _"),
         ("goto 5mm", 2, "goto takes X, Y and PHI, or the NAME of a pose"),
-        ("goto 5mm 0", 2, "goto takes X, Y and PHI: here are X = 5mm and Y = 0.000 mm, and PHI is missing, the angle"),
-        ("acquire --timeout 60s", 2, "--timeout: 60 s is none: 0.1 to 10 s would be right"),
+        ("goto 5mm 0", 2, "goto takes X, Y and PHI, but only X = 5mm and Y = 0.000 mm are given: add the angle PHI"),
+        ("acquire --timeout 60s", 2, "--timeout: 60 s: use 0.1 to 10 s"),
         ("teach 5mm", 1, "pose '5mm' reads as a number or a quantity"),
         ("teach 10", 1, "pose '10' reads as a number or a quantity"),
-        ("goto 0 0 0 --speed 50", 2, "--speed: '50' is no share of the limits: 0.001 to 1, or 0.1% to 100%"),
-        ("move 0 0 0 --speed 0", 2, "--speed: '0' is no share of the limits"),
-        ("sliders 0 0 0 --speed x", 2, "--speed: 'x' is no share of the limits"),
-        ("goto 0 0 0 4 5", 2, "trirail: 4 5 are more than it takes (trirail goto --help tells the usage)"),
-        ("enable now", 2, "trirail: now is more than it takes (trirail enable --help tells the usage)"),
+        ("goto 0 0 0 --speed 50", 2, "--speed: '50' is not a share of the limits: use 0.001 to 1, or 0.1% to 100%"),
+        ("move 0 0 0 --speed 0", 2, "--speed: '0' is not a share of the limits"),
+        ("sliders 0 0 0 --speed x", 2, "--speed: 'x' is not a share of the limits"),
+        ("goto 0 0 0 4 5", 2, "trirail: 4 5 are more than the command takes (trirail goto --help shows the usage)"),
+        ("enable now", 2, "trirail: now is more than the command takes (trirail enable --help shows the usage)"),
         (
             "workspace my.toml",
             2,
-            "trirail: my.toml is more than it takes: a configuration is --config my.toml "
-            "(trirail workspace --help tells the usage)",
+            "trirail: my.toml is more than the command takes: a configuration is --config my.toml "
+            "(trirail workspace --help shows the usage)",
         ),
-        ("enable my.toml", 2, "trirail: my.toml is more than it takes (trirail enable --help tells the usage)"),
+        (
+            "enable my.toml",
+            2,
+            "trirail: my.toml is more than the command takes (trirail enable --help shows the usage)",
+        ),
         ("goto 0,5 0 0", 2, ": write 0.5 with a decimal point"),
         ("goto -12,5mm 0 0", 2, ": write -12.5 with a decimal point"),
         ("override 12,5", 2, ": write 12.5 with a decimal point"),
         ("goto 0 0 0 --blend -1mm", 2, "--blend: '-1mm' is negative: a length such as 5mm"),
         ("jog 1mm/s 0 0 --seconds -1", 2, "--seconds: '-1' is negative: a time such as 2s"),
-        ("override 300", 2, "'300' is no override: 0, or 1 to 200 %"),
-        ("override 0.5%", 2, "'0.5%' is no override: 0, or 1 to 200 %"),
-        ("sessions --since yesterday", 2, "'yesterday' is no day or time such as 2026-01-31 or 2026-01-31T12:00:00"),
+        ("override 300", 2, "'300' is not an override: use 0, or 1 to 200 %"),
+        ("override 0.5%", 2, "'0.5%' is not an override: use 0, or 1 to 200 %"),
+        ("sessions --since yesterday", 2, "'yesterday' is not a day or time such as 2026-01-31 or 2026-01-31T12:00:00"),
         (
             f"stop --connect {NOBODY}",
             1,
@@ -225,7 +229,7 @@ class Slow:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("jog 0.01 0 0", "slowed 40 times: it would be beyond the limits"),
+        ("jog 0.01 0 0", "slowed 40 times, to keep within the limits"),
         ("goto 0 0 0 --wait", "slowed 40 times"),
         ("goto pick --wait", "slowed 40 times"),
         ("move 0 0 0 --wait", "slowed 40 times"),
@@ -301,7 +305,7 @@ def test_the_banner_names_the_next_command_where_it_reaches_the_service(capsys: 
 def test_who_asks_for_a_command_that_there_is_not_is_led_to_the_list_of_them(run: Run) -> None:
     code, _, err = run("dance")
     assert code == 2
-    assert err.endswith("(trirail --help tells the usage)\n")
+    assert err.endswith("(trirail --help shows the usage)\n")
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -477,7 +481,7 @@ def test_watch_into_a_pipe_is_a_line_a_second(monkeypatch: pytest.MonkeyPatch) -
                 yield SimpleNamespace(t=number / 8, mode="moving", pose=position, goal=goal, faults=("a",))
                 at[0] += 1 / 8
 
-    with pytest.raises(ServiceError, match="silent"):
+    with pytest.raises(ServiceError, match="no longer sends its state"):
         live.watch(Moving(1.0), json_lines=False)  # type: ignore[arg-type]
     assert [line.split("   ")[0] for line in said] == [f"{t} s  moving  x 10.000 mm" for t in ("0.00", "1.00", "2.00")]
     assert said[0].endswith("goal g-1 40%  a")

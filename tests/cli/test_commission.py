@@ -100,16 +100,16 @@ def test_ctrl_c_ends_it_and_the_report_stays(
 
 def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path: Path) -> None:
     (tmp_path / "precious.toml").write_text("precious")
-    with pytest.raises(ConfigError, match=r"precious\.toml exists already; name another file with --out"):
+    with pytest.raises(ConfigError, match=r"precious\.toml already exists; choose another file with --out"):
         run(robot, "--out", "precious.toml")
-    with pytest.raises(FileError, match=r"precious\.toml exists already; name another file with --report"):
+    with pytest.raises(FileError, match=r"precious\.toml already exists; choose another file with --report"):
         run(robot, "--report", "precious.toml")
     with pytest.raises(FaultSyntaxError, match="did you mean reversed"):
         run(robot, "--yes", "--fault", "A reverse", "--report", "a.json")
     real = tmp_path / "real.toml"
     real.write_text(SIM.read_text(encoding="utf-8").replace('interface = "simulated"', 'interface = "vcan"'))
     for option in (["--yes"], ["--fault", "A loose"]):
-        with pytest.raises(ConfigError, match=f"{option[0]} is for simulated drives"):
+        with pytest.raises(ConfigError, match=f"{option[0]} is only for simulated drives"):
             run(str(real), *option)
     assert (tmp_path / "precious.toml").read_text() == "precious"
 

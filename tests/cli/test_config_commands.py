@@ -70,13 +70,13 @@ def test_each_can_be_copied_to_a_file_or_into_a_folder_but_never_over_one(tmp_pa
         assert (tmp_path / Path(name).name).read_bytes() == (SIM.parent / name).read_bytes()
     assert answer(f"config copy sim {tmp_path / 'mine.toml'}")["file"] == str(tmp_path / "mine.toml")
     (tmp_path / "mine.toml").write_text("precious")
-    with pytest.raises(ConfigError, match=r"mine\.toml exists already: name another file"):
+    with pytest.raises(ConfigError, match=r"mine\.toml already exists: choose another file"):
         call(f"config copy sim {tmp_path / 'mine.toml'}")
     assert (tmp_path / "mine.toml").read_text() == "precious"
 
 
 def test_what_cannot_be_copied_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no configuration 'robot' is shipped: there are .*sim\.toml, "):
+    with pytest.raises(ConfigError, match=r"no configuration 'robot' is shipped: use one of .*sim\.toml, "):
         call(f"config copy robot {tmp_path}")
     with pytest.raises(ConfigError, match="No such file or directory"):
         call(f"config copy sim {tmp_path}/nowhere/my.toml")

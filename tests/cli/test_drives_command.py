@@ -37,7 +37,7 @@ def test_differences_are_written_when_that_is_asked_for(capsys: pytest.CaptureFi
     assert run("drives", str(SIM), "--apply") == 0
     words = capsys.readouterr().out
     assert "drive C, node 3" in words
-    assert "written: 1017:00 Producer heartbeat time: 0 -> 100, for this service's watch on it" in words
+    assert "written: 1017:00 Producer heartbeat time: 0 -> 100, for monitoring by this service" in words
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -53,9 +53,9 @@ def test_drives_that_tell_nothing(tmp_path: Path) -> None:
     text = SIM.read_text().replace('protocol = "cia402"', 'protocol = "odrive"')
     text = text.replace("counts_per_metre = 1e7", "counts_per_metre = 30.0")
     (tmp_path / "odrive.toml").write_text(text)
-    with pytest.raises(DriveError, match="have no objects to be shown"):
+    with pytest.raises(DriveError, match="have no objects to show"):
         run("drives", str(tmp_path / "odrive.toml"))
-    with pytest.raises(DriveError, match="protocol odrive have no object dictionary to be saved"):
+    with pytest.raises(DriveError, match="protocol odrive have no object dictionary to save"):
         run("drives", "save", str(tmp_path), "--config", str(tmp_path / "odrive.toml"))
 
 
@@ -84,7 +84,9 @@ def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pyte
     with pytest.raises(DriveError, match="drive A has serial 00000001h"):
         run("drives", "restore", str(b), "--drive", "A")
     b.write_text(b.read_text().replace("NodeID=2", "NodeID=9"))
-    with pytest.raises(DriveError, match=r"drive-B\.dcf has node id 9, the drives have 1, 2, 3; say which by --drive"):
+    with pytest.raises(
+        DriveError, match=r"drive-B\.dcf has node id 9, the drives have 1, 2, 3; select the drive with --drive"
+    ):
         run("drives", "restore", str(b))
     with pytest.raises(DriveError, match=r"drive B has node 00000002h \(the file's 00000009h\)"):
         run("drives", "restore", str(b), "--drive", "B")
@@ -107,10 +109,10 @@ def test_the_drives_that_answer_are_saved_and_the_others_named(
 def test_a_file_is_never_written_over(tmp_path: Path) -> None:
     assert run("drives", "save", str(tmp_path), "--drive", "B") == 0
     assert [path.name for path in tmp_path.iterdir()] == ["drive-B.dcf"]
-    with pytest.raises(FileError, match=r"drive-B\.dcf exists already"):
+    with pytest.raises(FileError, match=r"drive-B\.dcf already exists"):
         run("drives", "save", str(tmp_path))
     with pytest.raises(FileError, match="nowhere: no such folder"):
         run("drives", "save", str(tmp_path / "nowhere"))
-    with pytest.raises(FileError, match=r"drive-B\.dcf: a file, no folder; a configuration follows --config"):
+    with pytest.raises(FileError, match=r"drive-B\.dcf: a file, not a folder; give a configuration with --config"):
         run("drives", "save", str(tmp_path / "drive-B.dcf"))
     assert [path.name for path in tmp_path.iterdir()] == ["drive-B.dcf"]

@@ -72,7 +72,9 @@ def test_what_is_no_regular_file_is_refused(kind: str, command: list[str], tmp_p
 
 
 def test_who_names_no_configuration_is_told_how_to_get_one(tmp_path: Path, refused: Say) -> None:
-    assert "`trirail config copy sim` makes one to start from" in refused(["run", str(tmp_path / "x.toml")])
+    assert "create a configuration to start from with `trirail config copy sim`" in refused(
+        ["run", str(tmp_path / "x.toml")]
+    )
 
 
 def test_a_fifo_that_nobody_writes_to_is_refused_by_the_program(tmp_path: Path) -> None:

@@ -114,12 +114,12 @@ def test_what_there_is_is_listed(here: Path, capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("init",), "keys exists already"),
-        (("add", "ann", "--role", "viewer"), "users/ann exists already: trirail keys renew ann"),
-        (("add", "demo", "--role", "viewer"), "demo is the robot itself"),
+        (("init",), "keys already exists"),
+        (("add", "ann", "--role", "viewer"), "users/ann already exists: extend the certificate with"),
+        (("add", "demo", "--role", "viewer"), "demo is the name of the robot"),
         (("renew", "bob"), "there is no user bob"),
         (("revoke", "bob"), "there is no user bob"),
-        (("revoke", "demo"), "demo is the robot itself"),
+        (("revoke", "demo"), "demo is the robot itself, and cannot be revoked"),
         (("list", "--folder", "none"), "none/cert.pem: No such file or directory"),
         (("add", "bob", "--role", "viewer", "--folder", "none"), "none/cert.pem: No such file or directory"),
     ],
@@ -221,7 +221,7 @@ def test_what_is_expired_and_who_has_no_certificate_stand_out(
     assert [(check.verdict, check.found) for check in told] == [
         ("warning", f"ann cannot connect: {troubles['ann']}"),
         ("warning", f"ghost cannot connect: {troubles['ghost'].replace('keys/users', f'{here}/keys/users')}"),
-        ("warning", "nobody has a role and no certificate"),
+        ("warning", "nobody has a role but no certificate"),
     ]
     (here / "keys/ca-key.pem").unlink()  # the authority is on another machine
     assert doctor.without_certificate(Guard(config).users, probes.issued(config)) == []
@@ -232,6 +232,6 @@ def test_what_is_expired_and_who_has_no_certificate_stand_out(
 )
 @pytest.mark.parametrize("words", [("init",), ("robot", "left")])
 def test_an_address_that_is_none_is_refused(here: Path, words: tuple[str, ...], address: str) -> None:
-    with pytest.raises(CycloptsError, match="is no host name or IP address, as"):
+    with pytest.raises(CycloptsError, match="is not a host name or IP address such as"):
         keys(*words, f"--address={address}")
     assert list(here.iterdir()) == []

@@ -81,11 +81,11 @@ def test_words_for_people(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("line", "leg", "value", "limit", "words"),
     [
-        ("ik 0.2 0 0", "B", -0.2, -0.17, "slider B: position -200 mm is beyond its limit -170 mm"),
-        ("ik 0.2 0 0", "B", -0.2, -0.17, "slider C: passive position -200 mm is beyond its limit -170 mm"),
+        ("ik 0.2 0 0", "B", -0.2, -0.17, "slider B: position -200 mm is beyond the limit of -170 mm"),
+        ("ik 0.2 0 0", "B", -0.2, -0.17, "slider C: passive position -200 mm is beyond the limit of -170 mm"),
         ("ik 0 0 1", "", math.pi / 3 - 1.0, 0.15, "platform phi: distance to singularity 2.70422°"),
         ("ik 0 0 60 --deg", "A", math.pi / 3, math.pi / 3, "leg A: edge parallel to its rail"),
-        ("fk 0 0.5 0", "B", 0.5, 0.34, "slider B: position 500 mm is beyond its limit 340 mm"),
+        ("fk 0 0.5 0", "B", 0.5, 0.34, "slider B: position 500 mm is beyond the limit of 340 mm"),
         ("fk 0.085 0.085 0.085", "", None, 0.15, "distance to singularity"),
         ("fk -0.1 0.34 -0.1", "B", None, -0.17, "slider B: passive position"),
     ],
@@ -105,9 +105,9 @@ def test_what_cannot_be_reached_is_an_error(line: str, leg: str, value: float | 
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("ik 0 0.2 0", "platform y: position 200 mm is beyond its limit 150 mm"),
-        ("ik 0 0 0 --velocity 2 0 0", "slider B: velocity -2000 mm/s is beyond its limit"),
-        ("ik 0 0 0 --acceleration 0 20 0", "slider A: acceleration 23094 mm/s² is beyond its limit"),
+        ("ik 0 0.2 0", "platform y: position 200 mm is beyond the limit of 150 mm"),
+        ("ik 0 0 0 --velocity 2 0 0", "slider B: velocity -2000 mm/s is beyond the limit of"),
+        ("ik 0 0 0 --acceleration 0 20 0", "slider A: acceleration 23094 mm/s² is beyond the limit of"),
     ],
 )
 def test_what_only_the_service_refuses_is_a_warning(line: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -160,7 +160,7 @@ def test_the_workspace_of_another_robot(answer: Any, tmp_path: Path) -> None:
     config.write_text(SIM.read_text(encoding="utf-8").replace("[-0.17, 0.34]", "[-0.1, 0.2]"), encoding="utf-8")
     found = answer(f"workspace --phi 0 --config {config}")
     assert_allclose(found["slices"][0]["reachable"]["area"], 9 * math.sqrt(3) / 4 * 0.1**2)
-    with pytest.raises(KinematicsError, match=r"beyond its limit -100 mm"):
+    with pytest.raises(KinematicsError, match=r"beyond the limit of -100 mm"):
         call(f"ik 0.15 0 0 --config {config}")
     with pytest.raises(TrirailError, match=r"nowhere\.toml"):
         call(f"fk 0 0 0 --config {tmp_path / 'nowhere.toml'}")

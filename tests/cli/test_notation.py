@@ -156,13 +156,13 @@ def test_what_ik_and_fk_print_is_what_they_take(run: Run) -> None:
         ("jog 5mm 0 0", "'5mm' is not a velocity such as 5mm/s"),
         ("jog 0 0 1deg", "'1deg' is not an angular velocity such as 1.5deg/s"),
         ("jog 0 0 0 --seconds x", "'x' is not a time such as 2s"),
-        ("override fast", "'fast' is no override: 0, or 1 to 200 %"),
+        ("override fast", "'fast' is not an override: use 0, or 1 to 200 %"),
         ("ik 0 0 0 --velocity 1 2 x", "Invalid value for velocity: 'x' is not an angular velocity"),
         ("workspace --phi 1mm", "'1mm' is not an angle"),
-        ("goto -- -0.06 0 0 --speed 0.5", "--speed stands behind --"),
-        ("goto -- -0.06 0 0 --speed=0.5", "--speed stands behind --"),
+        ("goto -- -0.06 0 0 --speed 0.5", "--speed follows --"),
+        ("goto -- -0.06 0 0 --speed=0.5", "--speed follows --"),
         ("goto 0 0 0 --sped 0.5", "Did you mean --speed?"),
-        ("goto 0 0", "goto takes X, Y and PHI: here are X = 0 and Y = 0.000 mm, and PHI is missing"),
+        ("goto 0 0", "goto takes X, Y and PHI, but only X = 0 and Y = 0.000 mm are given"),
         ("jog 1mm/s 0", "jog takes VX, VY and W, or none of them"),
     ],
 )
@@ -171,7 +171,7 @@ def test_what_is_wrong_is_one_line_that_says_what_would_be_right(line: str, said
     assert (code, out) == (2, "")
     assert said in err
     assert err.count("\n") == 1
-    assert err.endswith(f"(trirail {line.split(maxsplit=1)[0]} --help tells the usage)\n")
+    assert err.endswith(f"(trirail {line.split(maxsplit=1)[0]} --help shows the usage)\n")
 
 
 @pytest.mark.parametrize(
@@ -197,15 +197,15 @@ def test_a_tool_is_a_point_or_a_name(line: str, tool: object) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("goto 0 0 0 --tool 0.02", "'0.02' is half a point: U V, as 20mm 0, or a name of [frames.tool]"),
+        ("goto 0 0 0 --tool 0.02", "'0.02' is only half a point: give U V, such as 20mm 0, or a name of [frames.tool]"),
         ("goto 0 0 0 --tool 20mm,x", "'x' is not a length"),
-        ("goto 0 0 0 --tool a/b", "'a/b' is neither a point, as 20mm 0, nor a name"),
-        ("goto 0 0", "goto takes X, Y and PHI: here are X = 0 and Y = 0.000 mm, and PHI is missing"),
-        ("goto 0.5", "goto takes X, Y and PHI, or the NAME of a pose: here is X = 0.5 alone"),
+        ("goto 0 0 0 --tool a/b", "'a/b' is neither a point, such as 20mm 0, nor a name"),
+        ("goto 0 0", "goto takes X, Y and PHI, but only X = 0 and Y = 0.000 mm are given"),
+        ("goto 0.5", "goto takes X, Y and PHI, or the NAME of a pose, but only X = 0.5 is given"),
         ("goto 10 mm 20 mm 0", "write no space before"),
         (
             "goto pick --tool camera",
-            "the pose of a NAME is where it was taught: it knows no --tool and no --frame",
+            "the pose of a NAME is fixed: it cannot be combined with --tool or --frame",
         ),
         ("goto pick 0 0", "Invalid value for X: 'pick' is not a length"),
     ],

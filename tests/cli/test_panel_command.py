@@ -62,7 +62,7 @@ def test_a_token_that_others_may_read_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "panel.token"
     read_token(file)
     file.chmod(0o640)
-    with pytest.raises(ConfigError, match=r"others may read this token \(mode 640\): chmod 600"):
+    with pytest.raises(ConfigError, match=r"other users can read this token \(mode 640\): run chmod 600"):
         read_token(file)
 
 

@@ -369,7 +369,7 @@ def test_a_robot_or_router_that_is_revoked_is_not_let_in(net: Net, tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("ann", "ann/cert.pem: the certificate of user ann, with which nobody serves others"),
+        ("ann", "ann/cert.pem: the certificate of user ann is not valid for a robot or router"),
         ("demo", "demo: the certificate of demo, which is behind this router"),
         ("other", "other: the certificate of other, which is behind this router"),
     ],
@@ -384,8 +384,12 @@ def test_a_router_does_not_start_as_a_user_or_as_one_of_its_robots(net: Net, nam
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("ann", "the certificate of user ann, with which nobody serves others"),
-        ("other", "the certificate of other, and a router takes robot demo by its name alone"),
+        ("ann", "the certificate of user ann is not valid for a robot or router"),
+        (
+            "other",
+            "the certificate has the name other, but a router accepts robot demo only with a certificate of the name "
+            "demo",
+        ),
     ],
 )
 def test_a_robot_does_not_start_as_a_user_nor_behind_a_router_as_another(net: Net, name: str, said: str) -> None:

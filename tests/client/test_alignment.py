@@ -189,7 +189,7 @@ def test_a_file_that_is_none_is_refused_with_its_name_and_the_remedy(how: str, t
 
 
 def test_a_file_that_is_not_there_is_made_by_a_calibration(tmp_path: Path) -> None:
-    with pytest.raises(TrirailError, match=r"camera\.json: no such file; trirail align calibrate makes it"):
+    with pytest.raises(TrirailError, match=r"camera\.json: no such file; create it with trirail align calibrate"):
         calibration_file.read(tmp_path / "camera.json")
 
 

@@ -294,5 +294,5 @@ def test_opening_that_is_cancelled_leaves_no_connection(silent: Silent, locator:
 
 
 def test_outside_of_its_context_it_says_so() -> None:
-    with pytest.raises(ServiceError, match="use it within `async with AsyncRobot"):
+    with pytest.raises(ServiceError, match="use the robot within `async with AsyncRobot"):
         asyncio.run(AsyncRobot("demo").enable())

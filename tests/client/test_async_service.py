@@ -38,7 +38,7 @@ async def until(robot: AsyncRobot, condition: Callable[[State], bool]) -> State:
         async for state in states:
             if condition(state):
                 return state
-    raise AssertionError("the service has gone silent")
+    raise AssertionError("the service no longer sends its state")
 
 
 def test_a_session(locator: str) -> None:

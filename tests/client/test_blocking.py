@@ -199,7 +199,7 @@ def test_a_function_that_a_call_calls_cannot_wait_for_the_same_robot(robot: Robo
         robot.state()
         return PoseGoal(0.0, 0.0, 0.0, id=name)
 
-    with pytest.raises(ServiceError, match="called by a function"):
+    with pytest.raises(ServiceError, match="must not call the robot"):
         robot.send(make)
 
 

@@ -135,4 +135,4 @@ def test_the_table_says_what_each_needs_and_hides_what_is_not_known(monkeypatch:
     assert "holding" not in lines[1]
     assert "drive B: EMCY 8700" in lines[2]
     assert "holding" in lines[3]
-    assert "3 robots, 2 need somebody" in lines[-1]
+    assert "3 robots, 2 need attention" in lines[-1]

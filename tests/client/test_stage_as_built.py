@@ -139,10 +139,10 @@ def test_records_of_a_time_are_waited_for_and_those_that_are_gone_are_named(monk
     timer.start()
     assert stage.pose_at(5.004) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
     timer.join()
-    with pytest.raises(ServiceError, match="before the records"):
+    with pytest.raises(ServiceError, match="before the first record"):
         stage.pose_at(4.0)
     monkeypatch.setattr(stage_as_built, "COMES_WITHIN", 0.01)
-    with pytest.raises(ServiceError, match="does the service run"):
+    with pytest.raises(ServiceError, match="check that the service is running"):
         stage.pose_at(6.0)
 
 

@@ -55,12 +55,12 @@ def test_a_cell_that_is_no_number_is_named(rows: list[tuple[float, ...]], data: 
     with pytest.raises(TrirailError) as refused:
         read_text(csv_of(cells))
     where = f"path.csv: line {line + 2}, column {HEAD[column]}: {wrong!r} is not a number"
-    assert f"{where}; a CSV has bare metres, radians and seconds" in str(refused.value)
+    assert f"{where}; write numbers without units, in metres, radians and seconds" in str(refused.value)
 
 
 @pytest.mark.parametrize("rows", [0, 1])
 def test_a_trajectory_of_fewer_than_two_points_is_told_by_its_file(rows: int) -> None:
-    said = rf"path\.(csv|json): {('no points', 'one point')[rows]}: a trajectory has 2 at least"
+    said = rf"path\.(csv|json): {('no points', 'one point')[rows]}: a trajectory needs at least 2"
     with pytest.raises(TrirailError, match=said):
         read_text(csv_of([["0"] * len(HEAD)] * rows))
     with pytest.raises(TrirailError, match=said):
@@ -79,7 +79,7 @@ def test_more_points_than_fit_are_refused_before_sending_with_both_numbers(tmp_p
     path = tmp_path / "path.csv"
     path.write_text("t,x,y,phi\n" + "".join(f"{t},{x},{y},{phi}\n" for t, x, y, phi in rows))
     for points in (rows, path):
-        with pytest.raises(TrirailError, match=rf"{number} points, a trajectory has 5000 at most: take every "):
+        with pytest.raises(TrirailError, match=rf"{number} points exceed the maximum of 5000: send every "):
             points_of(points)
 
 
@@ -87,5 +87,5 @@ def test_more_points_than_fit_are_refused_before_sending_with_both_numbers(tmp_p
 def test_time_counts_from_the_first_point_whatever_clock_it_is_of(begins: float) -> None:
     points = points_of([(begins + 0.5 * n, 0.001 * n, 0.0, 0.0) for n in range(3)])
     assert [point.t - begins for point in TrajectoryGoal(points).points] == [0.0, 0.5, 1.0]
-    with pytest.raises(ValueError, match="they last 86401 s, a trajectory 86400 s at most"):
+    with pytest.raises(ValueError, match="the trajectory lasts 86401 s, the maximum is 86400 s"):
         TrajectoryGoal(points_of([(begins, 0.0, 0.0, 0.0), (begins + 86_401.0, 0.0, 0.0, 0.0)]))

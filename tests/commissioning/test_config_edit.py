@@ -63,7 +63,7 @@ def test_no_file_is_written_over(tmp_path: Path) -> None:
     config_edit.write_new_file(first, "precious")
     second = config_edit.find_free_path(source)
     assert (first.name, second.name) == ("mine-commissioned.toml", "mine-commissioned-2.toml")
-    with pytest.raises(ConfigError, match="exists already"):
+    with pytest.raises(ConfigError, match="already exists"):
         config_edit.write_new_file(first, "other")
     assert first.read_text() == "precious"
 

@@ -340,7 +340,7 @@ def test_a_drive_without_a_watch_on_sync_is_told_from_one_without_any(
     watch = run.of("watchdog", name)
     assert watch.verdict == "ok", watch
     assert "8130" in watch.words[0]
-    assert "watch on heartbeats" in watch.words[1]
+    assert "monitoring heartbeats" in watch.words[1]
 
     (tmp_path / "report.json").unlink()
     monkeypatch.setattr(SimulatedDrive, "_master_lost", lambda self: None)

@@ -113,7 +113,7 @@ def test_what_is_wrong_with_a_map_is_said(tmp_path: Path) -> None:
     assert "correction.as_built.nodes" in said(ragged)
     missing = robot_file(tmp_path, b"")
     (tmp_path / "as_built.toml").unlink()
-    with pytest.raises(ConfigError, match=r"No such file or directory; python tools/calibrate\.py --map makes one"):
+    with pytest.raises(ConfigError, match=r"No such file or directory; create one with python tools/calibrate\.py "):
         load(missing)
 
 

@@ -66,7 +66,7 @@ def test_shipped_configurations_load(path: Path) -> None:
             "zenoh.listen[0] = 'tcp/0.0.0.0:7447': anyone on its network can move",
         ),
         (LISTEN, 'listen = ["tcp/127.0.0.1:1", "tcp/[::]:2"]', "zenoh.listen[1] = 'tcp/[::]:2': anyone on its network"),
-        (LISTEN, 'listen = ["tls/0.0.0.0:7447"]', "zenoh.listen[0] = 'tls/0.0.0.0:7447': it needs [zenoh.tls]"),
+        (LISTEN, 'listen = ["tls/0.0.0.0:7447"]', "zenoh.listen[0] = 'tls/0.0.0.0:7447': tls needs [zenoh.tls]"),
         (
             LISTEN,
             'listen = ["tcp/127.0.0.1"]',
@@ -101,7 +101,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         (
             LISTEN,
             f'{LISTEN}\n[zenoh.users]\nann = "viewer"',
-            "zenoh.users: without [zenoh.tls] users have no verified names",
+            "zenoh.users: without [zenoh.tls], the names of users are not verified",
         ),
         (
             LISTEN,
@@ -116,7 +116,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         (
             LISTEN,
             f'{TLS}\n[zenoh.users]\n"a b" = "viewer"',
-            "zenoh.users: 'a b' is no name here: expected text matching",
+            "zenoh.users: 'a b' is not a valid name here: expected text matching",
         ),
         ("[watchdogs]", "[watchdog]", "watchdog: unknown section; did you mean watchdogs?"),
         ("[zenoh]", "[drives.zenoh]", "drives.zenoh: unknown key; allowed are protocol"),
@@ -140,7 +140,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         (
             "[loop]",
             "[frames.tool]\n'my camera' = [0.1, 0.0]\n[loop]",
-            "frames.tool: 'my camera' is no name here: expected text matching",
+            "frames.tool: 'my camera' is not a valid name here: expected text matching",
         ),
         (
             "[loop]",
@@ -153,7 +153,7 @@ def test_shipped_configurations_load(path: Path) -> None:
             "node = 1",
             "node ids must differ, but are drives.A.node = 1, drives.B.node = 1, drives.C.node = 3, ",
         ),
-        ("node = 1", "node = 0", "drives.A.node = 0: on CANopen that addresses all nodes; expected 1 to 127"),
+        ("node = 1", "node = 0", "drives.A.node = 0: on CANopen, 0 addresses all nodes; use 1 to 127"),
         ("node = 2", "node = 128", "drives.B.node = 128: expected integer, 0 to 127"),
         (
             'protocol = "cia402"',
@@ -295,7 +295,7 @@ def test_only_a_bus_without_a_wire_is_faster_than_classical_can(interface: str, 
     if allowed:
         assert parse(text).can.bitrate == 8_000_000
     else:
-        with pytest.raises(ConfigError, match=r"can\.bitrate = 8000000: classical CAN ends at 1000000 bit/s"):
+        with pytest.raises(ConfigError, match=r"can\.bitrate = 8000000: the maximum of classical CAN is 1000000 bit/s"):
             parse(text)
 
 
@@ -303,7 +303,7 @@ def test_only_a_bus_without_a_wire_is_faster_than_classical_can(interface: str, 
 def test_what_stands_in_can_is_no_option(name: str) -> None:
     text = TEXT.replace('interface = "simulated"', 'interface = "gs_usb"')
     with pytest.raises(
-        ConfigError, match=rf"can.options.{name}: not an option; set interface, channel and bitrate in \[can\]"
+        ConfigError, match=rf"can.options.{name}: not allowed here; set interface, channel and bitrate in \[can\]"
     ):
         parse(f'{text}\n[can.options]\n{name} = "x"\n')
 
@@ -412,7 +412,7 @@ def run_a_little(config: Config) -> str:
         (
             "counts_per_metre = 1e7",
             'counts_per_metre = 1e7\nvelocity_unit = "1e400 counts/s"',
-            'drives.A.velocity_unit = "1e400 counts/s" is not a unit of velocities; use one such as',
+            'drives.A.velocity_unit = "1e400 counts/s" is not a unit of velocities; use a unit such as',
         ),
         (
             "feed_forward_gain = 0.95",
@@ -420,11 +420,11 @@ def run_a_little(config: Config) -> str:
             "can.simulated.feed_forward_gain = 9e+18: expected number, 0 to 2",
         ),
         ("rate_hz = 1000", "rate_hz = 2500", ""),
-        ("rate_hz = 1000", "rate_hz = 16", "object 60C2h takes 1 to 255 times a power of ten"),
+        ("rate_hz = 1000", "rate_hz = 16", "object 60C2h accepts 1 to 255 times a power of ten"),
         (
             "rate_hz = 1000",
             "rate_hz = 1",
-            "drives.heartbeat = 0.1: heartbeats go out with the cycle; expected at least",
+            "drives.heartbeat = 0.1: heartbeats are sent with the cycle; expected at least",
         ),
         ("bitrate = 1_000_000", "bitrate = 1", "can.bitrate = 1: expected integer, 10000 to 8000000"),
         ("velocity = 1.0", "velocity = 5e-5", "too coarse for limits.slider.velocity"),

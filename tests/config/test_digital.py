@@ -40,15 +40,21 @@ def table(section: str, name: str, **keys: Any) -> str:
             r"^inputs.part.bit = 2: bit 2 of object 60FDh is the home switch",
         ),
         ([table("inputs", "part", drive="D", bit=16)], r"^inputs.part.drive = 'D': expected one of 'A', 'B', 'C'"),
-        ([VALVE, VALVE.replace("valve", "lamp")], r"^outputs.lamp.bit = 16: .* drive A is output valve already; use"),
-        ([PART, PART.replace("part", "door")], r"^inputs.door.bit = 16: .* drive B is input part already; use another"),
-        ([VALVE, PART.replace("part", "valve")], r"^inputs.valve: an output is called valve already; use another"),
+        ([VALVE, VALVE.replace("valve", "lamp")], r"^outputs.lamp.bit = 16: .* A already belongs to output valve; use"),
+        (
+            [PART, PART.replace("part", "door")],
+            r"^inputs.door.bit = 16: .* drive B already belongs to input part; use another",
+        ),
+        (
+            [VALVE, PART.replace("part", "valve")],
+            r"^inputs.valve: the name valve already belongs to an output; use another",
+        ),
         ([table("outputs", "valve", drive="A", bit=16, delay=0.2)], r"^outputs.valve.delay = 0.2: .*0.1"),
         ([table("outputs", "valve", drive="A", bit=16, delay=-0.001)], r"^outputs.valve.delay = -0.001: .*0"),
         ([table("outputs", "valve", drive="A", bit=16, pin=3)], r"outputs.valve.pin: unknown key"),
         ([table("outputs", "valve", drive="A")], r"^outputs.valve.bit: missing key"),
-        ([table("outputs", '"a b"', drive="A", bit=16)], r"^outputs: 'a b' is no name here"),
-        ([table("inputs", '"5"', drive="A", bit=16)], r"^inputs: '5' is no name here"),
+        ([table("outputs", '"a b"', drive="A", bit=16)], r"^outputs: 'a b' is not a valid name here"),
+        ([table("inputs", '"5"', drive="A", bit=16)], r"^inputs: '5' is not a valid name here"),
     ],
 )
 def test_what_cannot_be_is_refused_with_key_and_remedy(sections: list[str], message: str) -> None:

@@ -43,7 +43,11 @@ def said(
 
 
 def test_enable_is_over_when_the_robot_is_no_longer_powering_up() -> None:
-    other = {Mode.ENABLING: NOT_YET, Mode.FAULT: WHY, Mode.DISABLED: "disabled while powering up"}
+    other = {
+        Mode.ENABLING: NOT_YET,
+        Mode.FAULT: WHY,
+        Mode.DISABLED: "the robot was disabled while the drives were powering up",
+    }
     for mode in Mode:
         latched = WHY if mode is Mode.FAULT else None
         assert said(Command.ENABLE, mode, saying(), latched) == other.get(mode, DONE), mode
@@ -74,7 +78,7 @@ def test_home_is_done_when_every_drive_is_homed() -> None:
     either = (False, True)
     for mode, a, b, c in product(Mode, either, either, either):
         measured = saying(ON, ON, ON, homed=(a, b, c))
-        for latched, why in {None: "stopped before every drive was homed", WHY: WHY}.items():
+        for latched, why in {None: "homing was stopped before all drives were homed", WHY: WHY}.items():
             over = NOT_YET if mode in (Mode.HOMING, Mode.STOPPING) else DONE if a and b and c else why
             assert said(Command.HOME, mode, measured, latched) == over, (mode, a, b, c)
 
@@ -89,11 +93,11 @@ def test_reset_is_done_when_the_drives_had_time_and_none_is_in_fault() -> None:
         faulty = state in (P.FAULT, P.FAULT_REACTION_ACTIVE)
         over = DONE if settled and not faulty else NOT_YET
         assert said(Command.RESET, Mode.DISABLED, measured, settled=settled) == over, (settled, state)
-        assert said(Command.RESET, Mode.FAULT, measured, WHY, settled) == f"the cause is still there: {WHY}"
+        assert said(Command.RESET, Mode.FAULT, measured, WHY, settled) == f"the cause of the fault persists: {WHY}"
 
 
 def test_still_powered_names_the_drives_that_can_move() -> None:
     for drive, state, measured in one_of_three():
-        states, _, advice = powered_message(measured, WHY).partition(" by its last statusword: ")
+        states, _, advice = powered_message(measured, WHY).partition(" according to the last statusword: ")
         assert states == (f"drive {drive} is {state}" if state in CAN_MOVE else "")
         assert advice == f"send reset again when the drives are at rest (fault: {WHY})"

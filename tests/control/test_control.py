@@ -87,7 +87,7 @@ def test_a_robot_outside_its_limits_holds_there_and_moves_back_alone(robots: Cal
     outside = inverse(ROBOT, np.array([0.155, 0.0, 0.0])).position.tolist()
     rig = robots(changed(CONFIG, start=tuple(outside)))
     rig.enable()
-    assert any("only motion back is accepted: platform x" in said.message for said in rig.notices)
+    assert any("only motion back towards them is accepted: platform x" in said.message for said in rig.notices)
     answer = refusal(rig.goal("out", 0.156, 0.0, 0.0))
     assert answer.code == "out_of_workspace"
     assert "platform x" in answer.message
@@ -101,7 +101,7 @@ def test_a_drive_that_does_not_power_up_is_named(rig: Rig, monkeypatch: pytest.M
     answer = refusal(rig.command("enable"))
     assert rig.mode is Mode.FAULT
     assert "drive A is switch on disabled" in answer.message
-    assert "2 s after enable" in answer.message
+    assert "enabled within 2 s" in answer.message
 
 
 def test_enabled_drives_whose_sliders_belong_to_no_pose_are_stopped(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,10 +183,10 @@ def test_too_fast_for_a_slider_is_slowed(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("pose", "code", "said"),
     [
-        ((0.5, 0.0, 0.0), "out_of_workspace", "platform x: position 500 mm is beyond its limit 150 mm"),
-        ((0.0, -0.2, 0.0), "out_of_workspace", "platform y: position -200 mm is beyond its limit -150 mm"),
-        ((0.0, 0.0, 0.9), "out_of_workspace", "platform phi: position 51.5662° is beyond its limit 48.7014°"),
-        ((0.14, 0.14, -0.9), "out_of_workspace", "the path leads out of the workspace after"),
+        ((0.5, 0.0, 0.0), "out_of_workspace", "platform x: position 500 mm is beyond the limit of 150 mm"),
+        ((0.0, -0.2, 0.0), "out_of_workspace", "platform y: position -200 mm is beyond the limit of -150 mm"),
+        ((0.0, 0.0, 0.9), "out_of_workspace", "platform phi: position 51.5662° is beyond the limit of 48.7014°"),
+        ((0.14, 0.14, -0.9), "out_of_workspace", "the path leaves the workspace after"),
     ],
 )
 def test_out_of_the_workspace(rig: Rig, pose: tuple[float, float, float], code: str, said: str) -> None:
@@ -421,7 +421,7 @@ def test_the_last_gate_knows_the_platforms_limits(rig: Rig) -> None:
     rig.cycle()
     rig.go_on_with(rest((0.1502, 0.0, 0.0)))
     rig.cycle()
-    assert "setpoint refused: platform x: position 150.2 mm is beyond its limit 150 mm" in (rig.control.fault or "")
+    assert "setpoint refused: platform x: position 150.2 mm is beyond the limit of 150 mm" in (rig.control.fault or "")
     assert quick_stops(rig) == {1, 2, 3}
 
 

@@ -129,7 +129,7 @@ def test_without_signs_of_life_the_robot_stops_and_the_lease_is_free(users: User
     assert leases(rig) == [("lease acquired by ann", "ann")]
     waited = rig.until(lambda: rig.control.lease.user is None)
     assert abs(waited - HELD) <= 2
-    assert leases(rig)[1:] == [("lease of ann is over: no sign of life for 1 s", None)]
+    assert leases(rig)[1:] == [("lease of ann has expired: it was not renewed within 1 s", None)]
     rig.until(rig.holds)
     assert ("g", "stopped") in rig.outcomes()
     assert code(users.tell("ann", "acquire", "l")) is RefusalCode.LEASE_OVER
@@ -154,7 +154,7 @@ def test_whatever_ends_it_stops_what_its_holder_has_under_way_and_what_waits(use
         late = users.tell("ann", "acquire", "l")
         assert code(late) is RefusalCode.LEASE_OVER
         assert isinstance(late, Refused)
-        assert late.message == "lease taken over by bob from ann: acquire a new one"
+        assert late.message == "lease taken over by bob from ann: acquire a new lease"
     else:
         rig.until(lambda: rig.control.lease.user is None)
     rig.until(rig.holds)
@@ -207,10 +207,10 @@ def test_who_does_not_hold_the_lease_releases_nothing_and_is_told_so(users: User
     def said(answer: Answer) -> tuple[RefusalCode, str] | None:
         return (answer.code, answer.message) if isinstance(answer, Refused) else None
 
-    nobody = RefusalCode.NO_LEASE, "nobody holds the lease: there is nothing to release"
+    nobody = RefusalCode.NO_LEASE, "no user holds the lease: there is nothing to release"
     assert said(users.tell("bob", "release")) == nobody
     users.tell("ann", "acquire", "l")
-    other = RefusalCode.LEASED, "ann holds the lease, and only its holder can release it"
+    other = RefusalCode.LEASED, "ann holds the lease: only the holder can release it"
     assert said(users.tell("bob", "release")) == other
     assert said(users.tell("bob", "release", "l")) == other
     assert users.rig.control.lease.user == "ann"

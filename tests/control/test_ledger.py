@@ -89,14 +89,14 @@ def test_an_id_is_good_for_one_goal(ledger: Ledger) -> None:
         with refused_as(RefusalCode.DUPLICATE_ID):
             ledger.check_id(asked(name))
     ledger.end("done", coded("arrived", EventCode.ARRIVED))
-    with pytest.raises(RefusedError, match="goal id 'g1' has been used") as refused:
+    with pytest.raises(RefusedError, match="goal id 'g1' has already been used") as refused:
         ledger.check_id(asked("g1"))
     ledger.refuse(asked("g1", ticket=9, user="bob"), refused.value)
     assert ledger.answers == [
-        Refused(9, RefusalCode.DUPLICATE_ID, "goal id 'g1' has been used: every goal needs its own")
+        Refused(9, RefusalCode.DUPLICATE_ID, "goal id 'g1' has already been used: give every goal its own id")
     ]
     assert len(ended(ledger)) == 3  # the one that had the id ended once
-    assert ledger.notices[-1].message == "goal id 'g1' has been used: every goal needs its own"
+    assert ledger.notices[-1].message == "goal id 'g1' has already been used: give every goal its own id"
     ledger.check_id(asked("g9"))
 
 

@@ -83,8 +83,8 @@ def test_a_frame_may_be_turned_by_any_angle(angle: float) -> None:
 @pytest.mark.parametrize(
     ("goal", "said"),
     [
-        (PoseGoal(0.0, 0.0, 0.0, tool="laser"), "no tool 'laser': there is camera"),
-        (PoseGoal(0.0, 0.0, 0.0, frame="table"), "no frame 'table': there is base, part"),
+        (PoseGoal(0.0, 0.0, 0.0, tool="laser"), "no tool 'laser': known are camera"),
+        (PoseGoal(0.0, 0.0, 0.0, frame="table"), "no frame 'table': known are base, part"),
         (PoseGoal(0.0, 0.0, 0.0, frame="platform"), "send a move in that frame"),
         (MoveGoal(0.0, 0.0, 0.0, tool="laser"), "no tool 'laser'"),
         (MoveGoal(0.0, 0.0, 0.0, frame="table"), "no frame 'table'"),
@@ -214,7 +214,7 @@ def test_a_move_while_a_goal_waits_half_way_is_refused_unless_it_is_from_where_t
     stood = rig.control.commanded.pose[0]
     assert 0.0 < stood < 0.1
     answer = refusal(rig.send("m1", MoveGoal(0.005, 0.0, 0.0)))
-    assert (answer.code, "send stop first" in answer.message) == ("moving", True)
+    assert (answer.code, "send stop or resume first" in answer.message) == ("moving", True)
     assert rig.control.commanded.pose[0] == stood
     if how == "pause":
         arrive(rig, "m2", MoveGoal(0.005, 0.0, 0.0, origin="measured"))

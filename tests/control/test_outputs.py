@@ -88,7 +88,7 @@ def rig() -> Rig:
 def test_an_output_is_set_with_the_next_setpoints(rig: Rig) -> None:
     assert isinstance(rig.set("valve", True), CommandDone)
     assert rig.value("valve")
-    assert [notice.message for notice in rig.notices if notice.kind == "output"] == ["output valve on by ann"]
+    assert [notice.message for notice in rig.notices if notice.kind == "output"] == ["output valve switched on by ann"]
     rig.set("valve", False)
     assert not rig.value("valve")
 
@@ -112,7 +112,7 @@ def test_outputs_are_safe_without_power(rig: Rig, how: str) -> None:
     refused = rig.set("valve", True)
     assert isinstance(refused, Refused)
     assert refused.code in (RefusalCode.NOT_ENABLED, RefusalCode.FAULT)
-    assert "output 'valve' keeps its safe value, off" in refused.message
+    assert "output 'valve' stays at its safe value, off" in refused.message
     assert isinstance(rig.set("light", False), CommandDone)  # always = true
     assert not rig.value("light")
 

@@ -173,7 +173,7 @@ def test_a_lost_planner_and_a_lost_gateway_end_checks(rig: ControlRig) -> None:
     assert code(rig, NEAR) == "planner_lost"
     meddler.change = lambda _: []
     tickets = [post(rig, NEAR), post(rig, NEAR)]
-    rig.control.handle(Disturbance("GATEWAY_LOST", "the gateway is gone"), 0)
+    rig.control.handle(Disturbance("GATEWAY_LOST", "the gateway has died"), 0)
     rig.cycle()
     assert [getattr(answer_to(rig, ticket), "code", "") for ticket in tickets] == ["busy", "busy"]
     meddler.change = lambda answer: [answer]

@@ -184,7 +184,7 @@ def test_a_goal_waits_its_own_time_for_a_planner_that_is_busy(
     if answer.code == "expired":
         assert valid_for is not None
         assert waited >= valid_for / PERIOD
-        assert f"it was valid for {valid_for:g} s" in answer.message
+        assert f"within its valid_for of {valid_for:g} s" in answer.message
     else:
         assert (answer.code, len(busy.asked)) == ("no_plan", 3)
     assert not told or longest > BUSY

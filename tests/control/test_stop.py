@@ -322,7 +322,7 @@ def test_what_was_renewed_and_refused_goes_on_to_say_why(rig: ControlRig, goal: 
     answer = rig.send("j1", goal)
     assert isinstance(answer, Refused)
     assert answer.code == "jog_over"
-    assert "rejected: the robot is disabled: send enable first; begin a new one" in answer.message
+    assert "rejected: the robot is disabled: send enable first); start a new goal" in answer.message
 
 
 def test_what_is_refused_in_fault_says_which_and_only_there(rig: ControlRig) -> None:

@@ -126,8 +126,8 @@ def imported_anew(interface: str) -> Iterator[None]:
         ("slcan", ("serial",), "pip install 'python-can[serial]'"),
         ("udp_multicast", ("msgpack",), "pip install 'python-can[multicast]'"),
         ("gs_usb", ("gs_usb", "usb"), "pip install 'python-can[gs-usb]'"),
-        ("kvaser", (), "Kvaser's CANlib (libcanlib.so), which is not installed; Linux knows these adapters"),
-        ("pcan", (), "PEAK's PCAN-Basic (libpcanbasic.so), which is not installed; Linux knows these adapters"),
+        ("kvaser", (), "Kvaser's CANlib (libcanlib.so), which is not installed; on Linux, these adapters"),
+        ("pcan", (), "PEAK's PCAN-Basic (libpcanbasic.so), which is not installed; on Linux, these adapters"),
     ],
 )  # fmt: skip
 def test_a_missing_library_is_named_with_its_package(

@@ -135,7 +135,7 @@ def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -
         axis.on_position(canopen_frames.POSITION.pack(0), T)
     assert not axis.pdo_silent
     axis.on_heartbeat(PRE_OPERATIONAL, T)
-    assert axis.find_fault(T, WANTED) == ("B", "state", 0, "drive B: left NMT operational: is pre-operational")
+    assert axis.find_fault(T, WANTED) == ("B", "state", 0, "drive B: has left NMT operational and is pre-operational")
     assert state_of(axis) is P.NOT_READY_TO_SWITCH_ON
     assert axis.pdo_silent
     assert axis.left_operational
@@ -160,7 +160,7 @@ def test_a_restart_stays_until_the_drive_is_configured_again() -> None:
         "B",
         "state",
         0,
-        "drive B: has restarted and lost its set-up: wait until it is configured again, then send reset",
+        "drive B: has restarted and lost its set-up: wait until the drive is configured again, then send reset",
     )
     assert axis.find_fault(T, WANTED) == said
     assert state_of(axis) is P.NOT_READY_TO_SWITCH_ON

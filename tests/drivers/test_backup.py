@@ -232,9 +232,9 @@ def test_a_file_has_every_value_to_the_last_bit(
         ("NodeID=1", "NodeID=first", "first"),
         ("[6065]", "[6065", "already exists"),
         ("[6065]", "[6066]", "section '6066' already exists"),
-        ("ParameterValue=4294967295", "ParameterValue=4294967296", "object 6065:00: 4294967296 is no value"),
-        ("ParameterValue=4294967295", "ParameterValue=-1", "object 6065:00: -1 is no value"),
-        ("ParameterValue=4294967295", "ParameterValue=1.5", "object 6065:00: '1.5' is no value"),
+        ("ParameterValue=4294967295", "ParameterValue=4294967296", "object 6065:00: 4294967296 is not a value"),
+        ("ParameterValue=4294967295", "ParameterValue=-1", "object 6065:00: -1 is not a value"),
+        ("ParameterValue=4294967295", "ParameterValue=1.5", "object 6065:00: '1.5' is not a value"),
         ("ParameterValue=4294967295", "ParameterValue=9\nLowLimit=10\nHighLimit=0x14", "9 is not within its limits"),
         ("ParameterValue=", "Parameter=", "no object has a ParameterValue"),
         ("[6065]", "[606x]", "a ParameterValue belongs to no object"),
@@ -301,9 +301,9 @@ def test_a_file_of_an_earlier_version_is_restored(tmp_path: Path) -> None:
         ("[drive]", "[other]", "drive"),
         ("node = 1", "node = 128", "node"),
         ('"6065:00"', '"6065"', "not enough values"),
-        ('type = "u32", value = 1000', 'type = "u8", value = 1000', "6065:00: 1000 is no value"),
+        ('type = "u32", value = 1000', 'type = "u8", value = 1000', "6065:00: 1000 is not a value"),
         ('type = "u32"', 'type = "u33"', "u33"),
-        ("value = 1000", "value = 1.5", "1.5 is no value"),
+        ("value = 1000", "value = 1.5", "1.5 is not a value"),
         ("[parameters]", "[parameters", "Expected"),
     ],
 )
@@ -411,7 +411,9 @@ def test_nothing_is_written_to_a_drive_with_power(state: int, tmp_path: Path) ->
     saved = rig.save()
     rig.a.put(0x6081, 5)
     rig.a.state = state
-    with pytest.raises(DriveError, match="drive A: parameters are only restored without power; its state is"):
+    with pytest.raises(
+        DriveError, match="drive A: parameters can only be restored while the drive has no power; its state is"
+    ):
         rig.restore(saved)
     assert not rig.a.written
     rig.wires.shutdown()
@@ -469,7 +471,7 @@ def test_no_other_master_may_be_on_the_bus(
     assert isinstance(rig.wires, Overheard)
     rig.wires.speaks = (rig.clock.now + 0.3, message)
     sent = len(rig.wires.sent)
-    with pytest.raises(DriveError, match=rf"another master is on the bus: it .*\(identifier {identifier:03X}\)"):
+    with pytest.raises(DriveError, match=rf"another master is on the bus and .*\(identifier {identifier:03X}\)"):
         rig.save() if doing == "save" else rig.restore(saved)
     assert len(rig.wires.sent) == sent
     rig.wires.shutdown()
@@ -481,7 +483,7 @@ def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
     rig.a.put(0x6081, 5)
     rig.a.put(0x6083, 5)
     rig.a.local.add_write_callback(lambda **_: rig.a.bus.send(frame(0x80)))  # type: ignore[no-untyped-call]
-    with pytest.raises(DriveError, match="another master is on the bus: it sends SYNC"):
+    with pytest.raises(DriveError, match="another master is on the bus and sends SYNC"):
         rig.restore(saved)
     assert len(rig.a.written) == 1
     rig.wires.shutdown()
@@ -490,8 +492,8 @@ def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "refused", "replaceable"),
     [
-        ({"product": 9}, "product is 00000002h, the file's 00000009h; use a file for the same product", False),
-        ({"vendor": 9}, "vendor is 00000001h, the file's 00000009h; use a file for the same product", False),
+        ({"product": 9}, "product is 00000002h, but the file has 00000009h; use a file for the same product", False),
+        ({"vendor": 9}, "vendor is 00000001h, but the file has 00000009h; use a file for the same product", False),
         ({"vendor": None}, r"drive A has vendor 00000001h \(the file's unknown\).*--replace", True),
         ({"device_type": 401}, "device_type is .*; use a file for the same product", False),
         ({"serial": 9}, r"drive A has serial 00000004h \(the file's 00000009h\).*--replace", True),
@@ -748,7 +750,7 @@ class TestFileOfAnotherProgram:
             ("RevisionNumber=0x00000000", "RevisionNumber=9", "--replace"),
             ("0x1388 ; counts/s", "25001", "6081:00: 25001 is not within its limits, 1 to 25000"),
             ("0x1388 ; counts/s", "0x1FFFFFFFF", "6081:00"),
-            ("0x1388 ; counts/s", "fast", "6081:00: 'fast' is no value"),
+            ("0x1388 ; counts/s", "fast", "6081:00: 'fast' is not a value"),
             ("2=100", "2=0x1FFFFFFFF", "607D:02"),
             ("[6083]", "[6081]", "already exists"),
             ("[6081]", "[6081SUB1]", "belongs to no object"),

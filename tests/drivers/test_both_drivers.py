@@ -28,7 +28,7 @@ def new(request: pytest.FixtureRequest) -> Iterator[AnyRig]:
 def test_a_bus_that_takes_no_frame_is_one_on_which_no_drive_answers(new: AnyRig) -> None:
     """Its queue is full, for nobody acknowledges while all drives are off."""
     new.bus.broken = True
-    with pytest.raises(DriveError, match=r"no answer .* is it powered and on this bus"):
+    with pytest.raises(DriveError, match=r"no answer .* check that the drive is powered and on this bus"):
         new.drives.configure(STEP)
 
 

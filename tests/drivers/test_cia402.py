@@ -203,7 +203,7 @@ class TestConfigure:
     def test_eds_that_is_none(self, tmp_path: Path, content: bytes) -> None:
         (tmp_path / "x.eds").write_bytes(content)
         with pytest.raises(
-            DriveError, match=r"^drive A: \S*x\.eds(?: is not an EDS as CiA 306 has it)?: .+"
+            DriveError, match=r"^drive A: \S*x\.eds(?: is not an EDS according to CiA 306)?: .+"
         ) as refused:
             Rig(changed("A", eds=str(tmp_path / "x.eds"))).drives.configure(PERIOD)
         assert "\n" not in str(refused.value)
@@ -241,7 +241,7 @@ class TestConfigure:
         ("keys", "said"),
         [
             ({"B": CONFIG.A}, "must differ, but are drives.A.node = 1, drives.B.node = 1"),
-            ({"A": Drive(0, 1e6)}, "drives.A.node = 0: on CANopen that addresses all nodes"),
+            ({"A": Drive(0, 1e6)}, "drives.A.node = 0: on CANopen, 0 addresses all nodes"),
             ({"heartbeat": 0.0001}, "highest rate that fits"),
             ({"heartbeat": 30.0}, r"heartbeat .*0\.001 to 21\.845"),
         ],

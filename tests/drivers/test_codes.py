@@ -29,7 +29,7 @@ SUPPLY = "check the supply; braking feeds energy back into it"
         (0x231F, "0x231F (current of the motor); check motor, cable and load"),
         (0x2A00, "0x2A00 (current); check motor, cable and load"),
         (0x9123, "0x9123 (external error); check the wiring of the drive's inputs"),
-        (0xFF07, "0xFF07 (the maker's own); see the drive's manual"),
+        (0xFF07, "0xFF07 (manufacturer-specific); see the drive's manual"),
         (0xB000, "0xB000 (of no class of CiA 301); see the drive's manual"),
     ],
 )

@@ -103,5 +103,5 @@ def test_objects_that_are_sound_are_used_and_others_told_with_section_and_line(
     "text", ["", "\n\n", "\ufeff", "\x1a", "[DeviceInfo]\nVendorName=x\n", "[5FFFsub1]\nDataType=7\n"]
 )
 def test_a_file_without_objects_is_refused(tmp_path: Path, text: str) -> None:
-    with pytest.raises(DriveError, match=r"^drive A: \S+ is not an EDS as CiA 306 has it: .+"):
+    with pytest.raises(DriveError, match=r"^drive A: \S+ is not an EDS according to CiA 306: .+"):
         load("A", written(tmp_path, text), NODE)

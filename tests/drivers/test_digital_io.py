@@ -89,7 +89,7 @@ def test_a_bit_that_the_maker_reserves_is_refused_by_name(rig: Rig) -> None:
     rig.bus.faults.poll(rig.clock.now)
     with pytest.raises(
         DriveError,
-        match=r"^drive A: object 60FE:02 .* stays 00010000h, expected 00030000h: its maker reserves bit 17; use",
+        match=r"^drive A: object 60FE:02 .* stays 00010000h, expected 00030000h: the manufacturer reserves bit 17; use",
     ):
         rig.drives.configure(STEP)
 
@@ -240,7 +240,7 @@ def test_an_odrive_has_no_such_faults() -> None:
     from drivers.test_odrive import Rig as OdriveRig
 
     rig = OdriveRig()
-    with pytest.raises(FaultSyntaxError, match="drive A has no digital outputs"):
+    with pytest.raises(FaultSyntaxError, match="drive A has no digital inputs"):
         rig.bus.faults.add("A output-stuck 16")
     assert rig.drives.path_outputs == (False, False, False)
     rig.drives.set_outputs((0, 0, 0))

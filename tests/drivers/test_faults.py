@@ -210,14 +210,14 @@ STOP = [
     Case("A lag 0.1", 100, r"slider A: following error", IN_MOTION, lasts=False),
     Case("C runaway 0.1", 100, r"slider C: following error", stands=1100, lasts=False),
     Case("C runaway -0.1", 100, r"slider C: following error", stands=1100, lasts=False),
-    Case("B reboot", 1, r"drive B: has restarted and lost its set-up: wait until it is configured again", lasts=False),
+    Case("B reboot", 1, r"drive B: has restarted and lost its set-up: wait until the drive", lasts=False),
     # the bus
     Case("bus-off", 1, r"CAN bus .* is down: bus-off"),
     Case("babble 001", 3, r"drive A: no position for 3 cycles in a row"),
 ]
 STOP_HOMING = [
-    Case("A stuck", 5500, r"drive A: homing: home was not attained within 5 s", lasts=False),
-    Case("A runaway 0.001", 5500, r"drive A: homing: home was not attained within 5 s", stands=1100, lasts=False),
+    Case("A stuck", 5500, r"drive A: homing: home was not reached within 5 s", lasts=False),
+    Case("A runaway 0.001", 5500, r"drive A: homing: home was not reached within 5 s", stands=1100, lasts=False),
     Case("A drop 0x581", 2000, r"drive A: homing: no answer for object 60\w\w:00", lasts=False),
     Case("A drop 0x601", 2000, r"drive A: homing: no answer for object 60\w\w:00", lasts=False),
     Case("A corrupt tpdo2", 2000, r"slider A: following error", lasts=False),
@@ -282,7 +282,9 @@ def assert_stops_until_reset(rig: FaultRig, case: Case, begun: Begin) -> None:
     if case.lasts:
         answer = rig.command("reset")
         assert isinstance(answer, Refused)
-        assert "the cause is still there" in answer.message or "by its last statusword" in answer.message
+        assert (
+            "the cause of the fault persists" in answer.message or "according to the last statusword" in answer.message
+        )
         assert rig.faulty()
     rig.mend()
     rig.cycles(LONG)

@@ -17,7 +17,7 @@ def test_a_drive_that_takes_8_ms_only_is_refused_with_the_rate_that_it_has(closi
     rig = closing(Rig("elmo_gold", Habits(values={(0x60C2, 1): 8, (0x60C2, 2): -3}, refuses=refuses)))
     with pytest.raises(DriveError, match=r"60C2:0\d .*; it holds 8 ms: set loop\.rate_hz = 125") as refused:
         rig.drives.configure(PERIOD)
-    assert str(refused.value).endswith("; drive B: the same; drive C: the same")
+    assert str(refused.value).endswith("; the same for drive B; the same for drive C")
     rig.drives.configure(0.008)
 
 
@@ -32,7 +32,7 @@ def test_what_is_found_of_one_drive_does_not_hide_what_is_found_of_another(closi
     said = str(refused.value)
     assert said.startswith("drive A: object 1000:00 (device type) is 00000191")
     assert "; drive B: object 6502:00 (supported drive modes) is 0000002D: neither" in said
-    assert said.endswith("; drive C: the same")
+    assert said.endswith("; the same for drive C")
     assert all(index == 0x6040 for node in rig.nodes for index, *_ in node.written)
 
 

@@ -159,7 +159,7 @@ def test_the_tables_of_objects_are_those_of_the_guide() -> None:
 @pytest.mark.parametrize(
     ("name", "keys", "said"),
     [
-        ("maxon_epos4_compact50_5", {"accept_without": ()}, r"drive A lacks protections: 1006, its watch on SYNC"),
+        ("maxon_epos4_compact50_5", {"accept_without": ()}, r"drive A lacks protections: 1006, its monitoring of SYNC"),
         ("nanotec_pd4n", {"accept_without": ("1006",)}, r'accept_without = \["1006", "6007", "605E"\]'),
         ("technosoft_ipos", {"acceleration_unit": None}, r"its unit of acceleration \(object 60AA\)"),
         (
@@ -222,7 +222,7 @@ def test_a_drive_that_keeps_a_sync_of_another_kind_is_refused(closing: Closing, 
 def test_a_drive_that_answers_no_guarding_is_not_watched_by_it(closing: Closing) -> None:
     rig = closing(Rig("technosoft_ipos", Habits(answers_guarding=False)))
     before = [(node.value(0x100C), node.value(0x100D)) for node in rig.nodes]
-    with pytest.raises(DriveError, match="drive A lacks protections: 1016, its watch on this service"):
+    with pytest.raises(DriveError, match="drive A lacks protections: 1016, its monitoring of this service"):
         rig.ready()
     assert [(node.value(0x100C), node.value(0x100D)) for node in rig.nodes] == before
     rig = closing(Rig("technosoft_ipos", Habits(answers_guarding=False), accept_without=("1016",)))

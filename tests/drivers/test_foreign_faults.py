@@ -102,7 +102,7 @@ def test_nmt_by_a_stranger_stops_all_in_the_same_cycle(rig: Rig, command: int, n
     with stranger(rig) as bus:
         bus.send(frame(0, bytes([command, node])))
         said = stopped_within(rig, 1)
-    assert said.startswith("CAN bus: another master is on it: it commands ")
+    assert said.startswith("CAN bus: another master is on the bus and commands ")
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_a_second_node_that_is_plugged_in_is_named(rig: Rig, data: bytes, after:
     with stranger(rig) as bus:
         bus.send(frame(0x702, data))
         assert stopped_within(rig, 1).startswith("drive B: ")
-        assert "drive B: a second node with id 2 on the bus: one has booted, or is not" in rig.last_fault(6)
+        assert "drive B: a second node with id 2 on the bus: one node has booted, or is not" in rig.last_fault(6)
     rig.drives.reset()
     assert rig.cycles(100).fault is None, "it has gone"
 
@@ -271,7 +271,7 @@ def test_a_drive_that_never_follows_is_not_enabled(closing: Closing) -> None:
         feedback = rig.cycle(rig.feedback.position)
         assert PowerState.OPERATION_ENABLED not in feedback.state
     assert feedback.fault is not None
-    assert feedback.fault.message.endswith('if it never sets that bit, set accept_without = ["6041"]')
+    assert feedback.fault.message.endswith('if the drive never sets bit 12, set accept_without = ["6041"]')
     rig = closing(Rig("elmo_gold", Habits(has_bit_12=False), accept_without=("6041",)))
     rig.ready()
     rig.enable()

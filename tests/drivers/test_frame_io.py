@@ -90,7 +90,7 @@ def test_an_end_that_dies_with_frames_unread_is_gone_and_stays_so() -> None:
         frames.send(Frame(0x201, b"\x06\x00"))
         far.socket.close()
         for _ in range(2):
-            with pytest.raises(can.CanOperationError, match="the listening end is gone"):
+            with pytest.raises(can.CanOperationError, match="the listening end has closed the connection"):
                 frames.receive()
 
 

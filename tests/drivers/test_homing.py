@@ -462,7 +462,7 @@ def test_homes_outside_the_limits_are_warned_of(robots: Robots) -> None:
     rig.enable()
     begin(rig)
     rig.until(lambda: rig.mode is Mode.HOLDING)
-    assert any("the robot is outside its limits, only motion back" in said.message for said in rig.notices)
+    assert any("the robot is outside its limits, and only motion back" in said.message for said in rig.notices)
 
 
 # ---------------------------------------------------------------------- what is refused
@@ -474,7 +474,7 @@ def test_absolute_encoders_need_none(robots: Robots) -> None:
         if mode is Mode.HOLDING:
             rig.enable()
         answer = refusal(rig.command("home"))
-        assert (answer.code, answer.message) == ("nothing_to_home", "absolute encoders: there is nothing to home")
+        assert (answer.code, answer.message) == ("nothing_to_home", "the encoders are absolute: homing is not needed")
 
 
 def test_goals_and_homing_in_the_wrong_mode(rig: Rig) -> None:

@@ -142,8 +142,8 @@ def test_what_the_set_up_owns_and_what_stores_is_refused(tmp_path: Path, index: 
 @pytest.mark.parametrize(
     ("lines", "example", "said"),
     [
-        (f'object = 0x208E\nvalue = 256\ntype = "u8"\n{WHY}', "elmo_gold", "value 256 is no u8"),
-        (f'object = 0x208E\nvalue = -1\ntype = "u8"\n{WHY}', "elmo_gold", "value -1 is no u8"),
+        (f'object = 0x208E\nvalue = 256\ntype = "u8"\n{WHY}', "elmo_gold", "value 256 is not a valid u8"),
+        (f'object = 0x208E\nvalue = -1\ntype = "u8"\n{WHY}', "elmo_gold", "value -1 is not a valid u8"),
         ('object = 0x208E\nvalue = 1\ntype = "u8"', "elmo_gold", "why"),
         (f'object = 0x208E\nvalue = 1\ntype = "u8"\n{WHY}', "odrive_s1", "has no object dictionary"),
     ],

@@ -131,7 +131,11 @@ class TestConfigure:
     @pytest.mark.parametrize("node", [7, 63, 100])
     def test_node_ids_that_cannot_be(self, node: int) -> None:
         drives = msgspec.structs.replace(CONFIG, C=Drive(node=node, counts_per_metre=25.0))
-        said = "drives.B.node = 7, drives.C.node = 7" if node == 7 else f"drives.C.node = {node}: an ODrive has 0 to 62"
+        said = (
+            "drives.B.node = 7, drives.C.node = 7"
+            if node == 7
+            else f"drives.C.node = {node}: the node id of an ODrive is 0 to 62"
+        )
         with pytest.raises(DriveError, match=said):
             Odrive(Bus([], Clock(), {}), 1_000_000, drives)
 

@@ -282,7 +282,13 @@ STOP = [
     Case("all silent", 3, SILENT.format("A"), stands=DEAF),
     Case("B fault 200 for 5", ASKED, r"drive B: error 0x00000200 DC_BUS_UNDER_VOLTAGE", stands=ROLLING),
     Case("B drop get_error; B fault 200 for 5", BEAT, r"drive B: error 0x00000200 DC_BUS_UNDER", stands=ROLLING),
-    Case("B lets go", BEAT, r"drive B: left closed loop control by itself: it is in idle", stands=ROLLING, lasts=False),
+    Case(
+        "B lets go",
+        BEAT,
+        r"drive B: has left closed loop control by itself and is in idle",
+        stands=ROLLING,
+        lasts=False,
+    ),
     Case("B short watchdog", ASKED, r"drive B: error 0x01000000 WATCHDOG_TIMER", stands=ROLLING, lasts=False),
     Case("A stuck", 60, FOLLOWING.format("A"), IN_MOTION, lasts=False),
     Case("A lag 0.1", 100, FOLLOWING.format("A"), IN_MOTION, stands=ROLLING, lasts=False),
@@ -290,7 +296,11 @@ STOP = [
     Case("C runaway 0.1", 100, FOLLOWING.format("C"), stands=ROLLING, lasts=False),
     Case("C runaway -0.1", 100, FOLLOWING.format("C"), stands=ROLLING, lasts=False),
     Case(
-        "B reboot", ASKED, r"drive B: has restarted: wait until its settings are checked", stands=ROLLING, lasts=False
+        "B reboot",
+        ASKED,
+        r"drive B: has restarted: wait until its settings have been checked",
+        stands=ROLLING,
+        lasts=False,
     ),
     Case("B reboot for 0.1", 3, SILENT.format("B"), stands=ROLLING, lasts=False),
     # the bus

@@ -210,9 +210,9 @@ def test_a_users_own_table_makes_a_firmware_known(
     ("content", "said"),
     [
         (table(S1, {}), r"is for firmware 0\.6\.10 on hardware 5\.2\.0, but the drive has firmware 0\.6\.99 on"),
-        (table(UNKNOWN, {WATCHDOG: -1}), r"it lacks axis0\.config\.enable_watchdog"),
-        (table(UNKNOWN, {SCALE: 70_000}), r"is endpoint 70000 of type 'uint32', which no message holds"),
-        (table(UNKNOWN, {}, {SCALE: "uint64"}), r"of type 'uint64', which no message holds"),
+        (table(UNKNOWN, {WATCHDOG: -1}), r"the file lacks axis0\.config\.enable_watchdog"),
+        (table(UNKNOWN, {SCALE: 70_000}), r"is endpoint 70000 of type 'uint32', which fits in no message"),
+        (table(UNKNOWN, {}, {SCALE: "uint64"}), r"of type 'uint64', which fits in no message"),
         ("{}", r"is not a valid flat_endpoints\.json \(Object missing"),
         ("[", r"is not a valid flat_endpoints\.json"),
         (None, r"No such file"),

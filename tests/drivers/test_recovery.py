@@ -152,12 +152,12 @@ def test_reset_is_refused_with_drive_and_progress(rig: RecoveryRig) -> None:
     assert expected is not None
     assert expected.objects >= asked
     assert expected.expected > number
-    assert f"the cause is still there: drive B restarted: {work} (" in answer.message
+    assert f"the cause of the fault persists: drive B has restarted: {work} (" in answer.message
     assert f" of {expected.expected} {counted})" in answer.message
     rig.recover()
-    assert rig.said(f"drive B restarted: {work}") == [f"drive B restarted: {work}", *rig.said("reset refused")]
+    assert rig.said(f"drive B has restarted: {work}") == [f"drive B has restarted: {work}", *rig.said("reset refused")]
     assert rig.said("drive B is configured") == [
-        "drive B is configured, as all drives are now: send reset, then enable"
+        "drive B is configured, and so are the others: send reset, then enable"
     ]
 
 
@@ -172,7 +172,7 @@ def test_no_set_up_is_sent_while_another_drive_has_power(rig: RecoveryRig) -> No
     rig.cycles(500)
     assert rig.drives[2].power is PowerState.OPERATION_ENABLED
     assert rig.asked == []
-    assert "when no drive has power" in "; ".join(rig.control.measured.unready)
+    assert "once no drive has power" in "; ".join(rig.control.measured.unready)
     rig.bus.faults.clear()
     rig.recover()
 
@@ -183,10 +183,10 @@ def test_a_drive_in_the_place_of_another_is_refused_by_name(rig: RecoveryRig) ->
     rig.cycles(200)
     rig.supply(2)
     rig.drives[2].objects[0x1018, 4].value += 1
-    rig.until(lambda: bool(rig.said("another drive is in its place: serial number")), ENDS)
+    rig.until(lambda: bool(rig.said("the drive has been replaced: serial number")), ENDS)
     answer = rig.command("reset")
     assert isinstance(answer, Refused)
-    assert "drive C: another drive is in its place: serial number" in answer.message
+    assert "drive C: the drive has been replaced: serial number" in answer.message
     assert "allow_replacement" in answer.message
     asked = len(rig.asked)
     rig.cycles(round(0.9 * RETRY_AFTER / rig.config.period))
@@ -238,7 +238,7 @@ def test_a_drive_may_be_replaced_where_the_configuration_allows_it(subindex: int
     rig.cycles(20)
     rig.supply(2)
     rig.drives[2].objects[0x1018, 2].value += 1
-    rig.until(lambda: bool(rig.said("another drive is in its place: product code")), ENDS)
+    rig.until(lambda: bool(rig.said("the drive has been replaced: product code")), ENDS)
     rig.cut(2)
     rig.cycles(20)
     rig.supply(2)
@@ -259,7 +259,7 @@ def test_an_odrive_may_be_replaced_where_the_configuration_allows_it() -> None:
     before = odrive.version
     odrive.version = before._replace(hardware=(5, 2, 0))
     rig.supply(2)
-    rig.until(lambda: bool(rig.said("another drive is in its place: hardware 5.2.0, was 4.4.58; restart")), ENDS)
+    rig.until(lambda: bool(rig.said("the drive has been replaced: hardware 5.2.0, was 4.4.58; restart")), ENDS)
     rig.cut(2)
     odrive.version, odrive.serial = before._replace(firmware=(0, 6, 99)), 7
     rig.supply(2)
@@ -302,7 +302,7 @@ def test_an_odrive_whose_position_is_relative_is_not_homed() -> None:
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
     assert rig.said("drive A: axis0.pos_vel_mapper.status is 9, relative")
-    assert rig.said("slider A: position unknown since its drive was off")
+    assert rig.said("slider A: the position is unknown because the drive was off")
     rig.bus.shutdown()
 
 
@@ -346,7 +346,7 @@ def test_an_incremental_encoder_makes_the_robot_not_homed() -> None:
     answer = rig.goal("g", 0.01, 0.0, 0.0)
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
-    assert rig.said("slider A: position unknown since its drive was off: send home")
+    assert rig.said("slider A: the position is unknown because the drive was off; send home")
     assert isinstance(rig.command("home"), CommandDone)
     rig.goal("g2", 0.01, 0.0, 0.0)
     rig.until(lambda: ("g2", "done") in rig.outcomes())

@@ -134,11 +134,11 @@ STEPS: Final = {"cia402": 800, "odrive": 150}
 """Cycles that the configuration of three drives takes, or some more."""
 SAME, TWICE, AGAIN = "same", "boots twice", "lost again"
 OTHERS: Final = {
-    ("cia402", "other serial number"): "another drive is in its place: serial number",
-    ("cia402", "other firmware"): "another drive is in its place: revision",
+    ("cia402", "other serial number"): "the drive has been replaced: serial number",
+    ("cia402", "other firmware"): "the drive has been replaced: revision",
     ("cia402", "lost settings"): "",
-    ("odrive", "other serial number"): "another drive is in its place: serial number",
-    ("odrive", "other firmware"): "another drive is in its place: firmware 0.6.9, was 0.6.10",
+    ("odrive", "other serial number"): "the drive has been replaced: serial number",
+    ("odrive", "other firmware"): "the drive has been replaced: firmware 0.6.9, was 0.6.10",
     ("odrive", "lost settings"): f"enable_watchdog, its stop when the host is silent: {WATCHDOG} is False",
 }
 """What is said of a drive that comes back otherwise; "" where it is set up all the same."""

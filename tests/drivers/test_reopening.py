@@ -248,7 +248,7 @@ def test_a_bus_that_is_lost_comes_back(rig: BusRig, seed: int) -> None:
             rig.cycles(draw.randrange(400))  # of the configuration
     rig.recover()
     assert rig.said("CAN bus can0 is down: ")
-    assert rig.said("CAN bus can0 is back")
+    assert rig.said("CAN bus can0 is up again")
     assert len(rig.opened) >= 2
 
 
@@ -267,7 +267,7 @@ def test_reset_is_refused_with_the_reason_until_the_bus_is_back(rig: BusRig) -> 
     rig.cycles(1)
     answer = rig.command("reset")
     assert isinstance(answer, Refused)
-    assert 'the cause is still there: CAN bus can0 is down: there is no CAN interface "can0"' in answer.message
+    assert 'the cause of the fault persists: CAN bus can0 is down: there is no CAN interface "can0"' in answer.message
     rig.until(lambda: rig.pending is not None)
     rig.finish()
     rig.recover()
@@ -308,7 +308,7 @@ def test_a_full_queue_of_python_cans_is_no_flicker(rig: BusRig) -> None:
         rig.cycles(100)
         assert rig.down
     assert len(rig.said("CAN bus can0 is down: ")) == 1
-    assert not rig.said("CAN bus can0 is back")
+    assert not rig.said("CAN bus can0 is up again")
     rig.supply(0, 1, 2)
     rig.recover()
 

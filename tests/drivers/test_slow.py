@@ -102,7 +102,7 @@ def test_a_drive_that_never_boots_is_told_with_the_time_that_it_was_given(closin
 def test_a_drive_that_restarts_while_it_is_set_up_is_told(closing: Closing) -> None:
     rig = closing(SlowRig("elmo_gold", lambda _: Slowness(answer=lambda: 0.01)))
     rig.wires.slow[2].boots_in(0.5)
-    with pytest.raises(DriveError, match=r"^drive C: restarted during its set-up"):
+    with pytest.raises(DriveError, match=r"^drive C: the drive restarted during its set-up"):
         rig.drives.configure(PERIOD)
     rig.drives.close()
 

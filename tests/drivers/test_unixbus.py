@@ -76,7 +76,7 @@ def test_a_peer_that_leaves_or_does_not_read_hinders_nobody(hub: UnixBus, path: 
 def test_a_path_with_nobody_with_somebody_or_that_is_none_is_told_with_the_remedy(path: str) -> None:
     with pytest.raises(BusError, match=r"no process listens there; start tools/virtual_drives\.py"):
         UnixBus(path)
-    with UnixBus(path, listen=True), pytest.raises(BusError, match="another process listens there"):
+    with UnixBus(path, listen=True), pytest.raises(BusError, match="another process already listens"):
         UnixBus(path, listen=True)
     with pytest.raises(BusError, match="cannot listen there"):
         UnixBus(f"{path}/can", listen=True)

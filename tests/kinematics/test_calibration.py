@@ -237,7 +237,7 @@ def test_a_wrong_row_is_found() -> None:
     measured = noisy(random, seen)
     measured[17, 1] += 2e-3
     with pytest.raises(
-        CalibrationError, match=r"no geometry fits: the residuals are .* greatest at this pose"
+        CalibrationError, match=r"no geometry fits: the residuals are .* at this pose, the worst"
     ) as refused:
         identify(START, measured, inverse(robot, seen).position)
     assert refused.value.row == 17
@@ -255,7 +255,7 @@ def test_a_pose_out_of_reach_is_found() -> None:
     seen = poses(random, 20)
     sliders = inverse(START, seen).position
     sliders[4] += 1.0
-    with pytest.raises(CalibrationError, match="out of the starting geometry's reach") as refused:
+    with pytest.raises(CalibrationError, match="out of reach of the starting geometry") as refused:
         identify(START, seen, sliders)
     assert refused.value.row == 4
 

@@ -156,7 +156,7 @@ def test_what_is_no_number_is_refused_as_ever() -> None:
         (LOW, HIGH, np.zeros((4, 4, 4)), "expected"),
         (LOW, HIGH, np.full((4, 4, 4, 3), np.nan), "not finite"),
         (LOW, (0.1, np.inf, 0.1), np.zeros((4, 4, 4, 3)), "not finite"),
-        (LOW, (0.1, -0.15, 0.1), np.zeros((4, 4, 4, 3)), "no inside"),
+        (LOW, (0.1, -0.15, 0.1), np.zeros((4, 4, 4, 3)), "is empty"),
     ],
 )
 def test_what_is_no_map_is_refused(low: object, high: object, nodes: Array, said: str) -> None:

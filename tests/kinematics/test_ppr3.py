@@ -36,7 +36,7 @@ def test_a_cross_slide_is_square_to_its_rail_where_nobody_says_otherwise() -> No
     legs = [CrossLeg(leg.anchor, leg.rail_angle, leg.home, leg.pivot) for leg in UVW.legs]
     assert Geometry(kind="3-PPR", legs=(legs[0], legs[1], legs[2])) == UVW
     assert UVW.kind == "3-PPR"
-    with pytest.raises(KinematicsError, match=r"kind is '3-PRP', and the legs are those of a 3-PPR robot"):
+    with pytest.raises(KinematicsError, match=r"kind is '3-PRP', but the legs are those of a 3-PPR robot"):
         Geometry(kind="3-PRP", legs=UVW.legs)
 
 

@@ -183,7 +183,7 @@ def test_too_fast_says_for_what_and_what_would_be_right(rig: ControlRig, coordin
     assert answer.code == "too_fast"
     assert answer.value is not None
     name = ("x", "y", "phi")[coordinate]
-    assert f"times too fast for the platform's {name}: let it take" in answer.message
+    assert f"times too fast for the platform's {name}: let it last" in answer.message
     peaks = np.array((1.875 / 0.4, 10.0 / math.sqrt(3.0) / 0.4**2, 60.0 / 0.4**3))  # of a quintic from rest to rest
     used = peaks * (0.1, 0.1, 0.4)[coordinate] / PLATFORM[:, coordinate]
     assert answer.value == pytest.approx((used ** (1.0, 1.0 / 2.0, 1.0 / 3.0)).max(), rel=0.01)
@@ -359,7 +359,7 @@ def test_a_motion_that_ends_at_once_is_a_fault(rig: ControlRig) -> None:
 def test_a_position_just_beyond_its_limit_is_told_from_it(rig: ControlRig) -> None:
     rig.enable()
     answer = refusal(rig.send("g1", SlidersGoal((-0.1700001, 0.0, 0.0))))
-    assert "slider A: position is 100 nm beyond its limit -170 mm" in answer.message
+    assert "slider A: position is 100 nm beyond the limit of -170 mm" in answer.message
     assert (answer.value, answer.limit) == (-0.1700001, -0.17)
 
 
@@ -437,17 +437,17 @@ def test_a_jog_meant_in_millimetres_or_degrees_is_told_so(
 @pytest.mark.parametrize(
     ("pose", "said"),
     [
-        ((0.01, -20.0, 0.0), "platform y: position -20000 mm is beyond its limit -150 mm: did you mean -20 mm?"),
-        ((0.0, 0.0, 30.0), "platform phi: position 1718.87° is beyond its limit 48.7014°: did you mean 30°?"),
-        ((0.2, 0.0, 0.0), "platform x: position 200 mm is beyond its limit 150 mm"),
-        ((0.0, 0.0, 1.0), "platform phi: position 57.2958° is beyond its limit 48.7014°"),
+        ((0.01, -20.0, 0.0), "platform y: position -20000 mm is beyond the limit of -150 mm: did you mean -20 mm?"),
+        ((0.0, 0.0, 30.0), "platform phi: position 1718.87° is beyond the limit of 48.7014°: did you mean 30°?"),
+        ((0.2, 0.0, 0.0), "platform x: position 200 mm is beyond the limit of 150 mm"),
+        ((0.0, 0.0, 1.0), "platform phi: position 57.2958° is beyond the limit of 48.7014°"),
     ],
 )
 def test_a_pose_meant_in_millimetres_or_degrees_is_told_so(
     rig: ControlRig, pose: tuple[float, float, float], said: str
 ) -> None:
     rig.enable()
-    assert refusal(rig.send("g1", PoseGoal(*pose))).message == f"the goal is out of the workspace: {said}"
+    assert refusal(rig.send("g1", PoseGoal(*pose))).message == f"the goal is outside the workspace: {said}"
 
 
 def test_a_renewal_that_is_refused_ends_the_jog_at_once(rig: ControlRig) -> None:
@@ -522,7 +522,7 @@ def test_how_far_a_trajectory_may_begin_from_where_the_robot_stands(rig: Control
             assert refusal(answer).code == "wrong_start"
             name = ("x", "y", "phi")[coordinate]
             shown = "-0.00578687°" if name == "phi" else "-0.101 mm"
-            assert f"begins at {name} = {shown}, the robot is at 0" in refusal(answer).message
+            assert f"begins at {name} = {shown}, but the robot is at 0" in refusal(answer).message
         rig.until(rig.holds)
     assert_within_limits(rig)
 
@@ -538,4 +538,6 @@ def test_a_slider_beyond_its_travel_by_more_than_can_be_measured_is_enabled_with
     rig = ControlRig(changed(CONFIG, start=sliders_at(0.0, 0.0, high)))
     rig.enable()
     (warning,) = (said.message for said in rig.notices if said.level == "warning")
-    assert "the robot is outside its limits, only motion back is accepted: slider A: position" in warning
+    assert (
+        "the robot is outside its limits, and only motion back towards them is accepted: slider A: position" in warning
+    )

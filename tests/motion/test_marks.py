@@ -114,11 +114,14 @@ def test_a_stretch_opens_and_closes() -> None:
 @pytest.mark.parametrize(
     ("mark", "words"),
     [
-        (Mark("valve", after_start=0.06), "mark 0 of output 'valve' is at after_start = 60 mm; the path has 50 mm"),
+        (Mark("valve", after_start=0.06), "mark 0 of output 'valve' is at after_start = 60 mm; the path is 50 mm long"),
         (Mark("valve", before_target_s=60.0), "is at before_target_s = 60 s; the path takes"),
         (Mark("valve", at=Crossing(y=0.01)), "is at y = 10 mm; the path goes from 0 to 0 mm"),
-        (Mark("valve", start=0.0, increment=1e-6, pulse_width=1e-3), "has 50,001 pulses; a goal has 10,000 at most"),
-        (Mark("valve", start=0.0, increment=1e-5, pulse_width=1e-3), "is the least: lower the speed, or move"),
+        (
+            Mark("valve", start=0.0, increment=1e-6, pulse_width=1e-3),
+            "has 50,001 pulses; the maximum for a goal is 10,000",
+        ),
+        (Mark("valve", start=0.0, increment=1e-5, pulse_width=1e-3), " ms: lower the speed, or move"),
     ],
 )
 def test_marks_that_the_path_does_not_pass_are_refused(mark: Mark, words: str) -> None:

@@ -58,7 +58,7 @@ def test_one_that_is_sent_in_motion_is_told_to_wait(rig: ControlRig) -> None:
     points = TrajectoryPoint(0.0, x, 0.0, 0.0), TrajectoryPoint(1.0, 0.0, 0.0, 0.0)
     answer = refusal(rig.send("g2", TrajectoryGoal(points)))
     assert answer.code == "wrong_start"
-    assert "the robot moves: send the trajectory when it is at rest" in answer.message
+    assert "the robot is moving: send the trajectory when the robot is at rest" in answer.message
 
 
 @given(st.floats(0.03, 0.4), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.3, 0.3))
@@ -74,7 +74,7 @@ def test_one_that_is_too_fast_is_accepted_in_the_time_that_its_refusal_names(
     answer = rig.send("g1", within(duration))
     if isinstance(answer, Accepted):
         return
-    named = re.search(r"let it take ([0-9.]+) s", refusal(answer).message)
+    named = re.search(r"let it last ([0-9.]+) s", refusal(answer).message)
     assert named
     assert isinstance(rig.send("g2", within(float(named[1]))), Accepted)
 

@@ -137,7 +137,7 @@ class FakeRobot:
             if self.mode not in ("holding", "moving"):
                 raise RefusedError(RefusalCode.NOT_ENABLED, "the robot is disabled: send enable first")
             if goal_id in self._ended:
-                raise RefusedError(RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has been used")
+                raise RefusedError(RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has already been used")
             self._advance()
             if goal_id not in self._handles:
                 self._say_begun(goal_id)

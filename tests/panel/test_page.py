@@ -486,7 +486,7 @@ def test_nothing_is_drawn_where_it_may_not_be_before_there_is_a_state(browser: P
         page.write("#to-x", "1")
         page.write("#to-y", "1")
         page.write("#to-phi", "1")
-        page.until("document.querySelector('#going-says').textContent.includes('nobody knows where the robot is')")
+        page.until("document.querySelector('#going-says').textContent.includes('the position of the robot is unknown')")
         page.close()
 
 

@@ -90,7 +90,8 @@ def test_connections_that_open_no_session_are_told_once_with_the_wait_that_they_
     crowd.unopened["192.0.2.7"] = 600
     (warning,) = crowd.look(1)
     assert warning == (
-        "604 connections to the gateway open no session (600 from 192.0.2.7): a new one waits 60 s, no stop does"
+        "604 connections to the gateway have not opened a session (600 from 192.0.2.7): new ones wait 60 s; stops do "
+        "not"
     )
     assert crowd.crowding.use.unopened == 604
     crowd.unopened = Counter({"192.0.2.7": 18})

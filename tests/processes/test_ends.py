@@ -70,7 +70,7 @@ def frozen_and_replaced(service: Service) -> None:
     assert_stopped_smoothly(service.frames())
     recorded = recording(service)
     assert ("long", "stopped") in outcomes(recorded)
-    assert any("the gateway is frozen, no sign of life for 0.3 s" in event.message for event in events(recorded))
+    assert any("the gateway is frozen, without a sign of life for 0.3 s" in event.message for event in events(recorded))
 
 
 def test_a_frozen_recorder_is_replaced_and_the_robot_does_not_mind(service: Service) -> None:
@@ -100,7 +100,7 @@ def test_a_frozen_loop_ends_the_service_and_everyone_is_told(service: Service) -
             if event.mode == "fault":
                 break
     assert service.process.wait(END_WITHIN) == 1
-    assert "the loop is dead (no sign of life for 0.7 s, so it was killed): the drives stop" in service.log.read_text()
+    assert "the loop has died (no sign of life for 0.7 s, so it was killed): the drives stop" in service.log.read_text()
     assert "frozen" in heard[-1].message
     assert [(event.id, event.outcome) for event in heard if event.outcome] == [("long", "faulted")]
     recorded = recording(service)
@@ -125,7 +125,8 @@ def test_sigterm_to_the_loop_alone_is_told_as_what_it_is(service: Service) -> No
         os.kill(service.child("loop"), signal.SIGTERM)
         assert service.process.wait(END_WITHIN) == 1
     said = (
-        "the loop is dead (another process sent it SIGTERM): it has stopped the robot and disabled the drives; ending"
+        "the loop has died (another process sent it SIGTERM): the loop has stopped the robot and disabled the drives; "
+        "the service ends"
     )
     assert said in service.log.read_text()
     assert_stopped_smoothly(service.frames())
@@ -155,7 +156,7 @@ def test_a_killed_parent_leaves_nobody_and_a_complete_recording(name: str, servi
             wait_gone(process)
     if name == "fork-server":
         assert service.process.wait(END_WITHIN) == 1
-        assert "the process that forks the others has died (killed by SIGKILL)" in service.log.read_text()
+        assert "the process that starts the others has died (killed by SIGKILL)" in service.log.read_text()
     assert_stopped_smoothly(service.frames())
     recorded = recording(service)
     assert outcomes(recorded) == [("long", "stopped")]

@@ -129,12 +129,12 @@ def test_what_a_command_does_not_take_is_refused_with_what_it_takes(rig: Rig, na
     *carried_out, said = rig.sent
     assert [one.name for one in carried_out if isinstance(one, CommandRequest)] == [name] * (name in EVERYBODYS_STOPS)
     assert isinstance(said, Announcement)
-    assert said.notice.message.startswith(f"{name} takes {name.content.words}: ")
+    assert said.notice.message.startswith(f"{name} accepts {name.content.words}: ")
 
 
 def test_a_command_that_there_is_not_is_refused_with_those_that_there_are(rig: Rig) -> None:
     rig.command("dance")
-    there_are = f"dance: no such command; there are {', '.join(Command)}"
+    there_are = f"unknown command dance: use one of {', '.join(Command)}"
     assert rig.sent == [Announcement(refused("ann", there_are, RefusalCode.UNKNOWN_COMMAND))]
 
 
@@ -150,7 +150,10 @@ def test_a_goal_that_has_waited_too_long_does_not_begin(rig: Rig, monkeypatch: p
     passed = rig.goals()
     assert [name for name, _ in passed] == ["a", "b", "c", "d", "e"]
     assert [withdrawn for _, withdrawn in passed[:4]] == [None] * 4
-    assert passed[4][1] == "it has waited longer than 8 s, for goals before it or a busy machine: send it again"
+    assert (
+        passed[4][1]
+        == "the goal waited longer than 8 s for earlier goals or because the machine was busy: send the goal again"
+    )
 
 
 def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:
@@ -194,7 +197,7 @@ def test_goals_of_one_who_floods_are_refused_and_nobody_elses(rig: Rig) -> None:
     for number in range(MAX_GOALS_OF_USER + GOALS_OF_ONE + 3):
         rig.goal(f"e{number}", "eve")
     rig.goal("a", "ann")
-    words = f"{GOALS_OF_ONE} goals of eve are waiting already: send fewer"
+    words = f"{GOALS_OF_ONE} goals of eve are already waiting, which is the maximum: send fewer goals"
     assert rig.refusals() == [refused("eve", words, RefusalCode.BUSY)] * 3
     assert rig.goals()[-1] == ("a", None)
 
@@ -253,7 +256,7 @@ def test_the_lease_is_taken_over_by_a_role_that_may(rig: Rig, monkeypatch: pytes
     if role is Role.MAINTAINER:
         assert rig.sent == [CommandRequest(1, "ann", Command.ACQUIRE, AcquireLease("l", 0.5, force=True))]
     else:
-        said = "ann is operator at demo: taking the lease over needs maintainer"
+        said = "ann is operator at robot demo: taking over the lease needs the role maintainer"
         assert rig.sent == [Announcement(refused("ann", said, RefusalCode.NOT_ALLOWED))]
 
 
@@ -310,7 +313,7 @@ def test_an_asker_that_takes_no_answer_holds_up_nobody_else(rig: Rig, tmp_path: 
                 asked += 1
                 (reply,) = other.get("trirail/demo/cmd/ann/dance", timeout=60.0)
                 assert reply.err is not None
-                assert "no such command" in reply.err.payload.to_string()
+                assert "unknown command" in reply.err.payload.to_string()
         finally:
             asker.kill()
             over.set()
@@ -321,7 +324,7 @@ def test_info_tells_what_the_drives_do_without(rig: Rig, monkeypatch: pytest.Mon
     """The loop says so in its welcome, before anybody can ask."""
     said: list[object] = []
     monkeypatch.setattr(rig.gateway._replies, "send", lambda _incoming, content: said.append(content))
-    missing = (MissingProtection("A", "1006", "its watch on SYNC"), MissingProtection("C", "6007", "its stop"))
+    missing = (MissingProtection("A", "1006", "its monitoring of SYNC"), MissingProtection("C", "6007", "its stop"))
     rig.hear(Welcome((), 0.5, missing))
     rig.gateway._handle(came("info", "trirail/demo/info", b""))
     (info,) = said
@@ -334,7 +337,7 @@ def test_info_follows_drives_that_are_set_up_later_and_nothing_is_declared_twice
 ) -> None:
     said: list[object] = []
     monkeypatch.setattr(rig.gateway._replies, "send", lambda _incoming, content: said.append(content))
-    missing = (MissingProtection("A", "1006", "its watch on SYNC"),)
+    missing = (MissingProtection("A", "1006", "its monitoring of SYNC"),)
     rig.hear(Welcome((), 0.5))
     declared = list(rig.gateway._inbox._declared)
     rig.hear(Welcome((), 0.5, missing))

@@ -177,7 +177,7 @@ def test_what_is_too_large_is_refused_when_it_comes_and_its_memory_is_not_held(t
             client.get(f"trirail/demo/{name}", zenoh.handlers.FifoChannel(1), payload=content, attachment=attached)
             incoming, error = refused.get(timeout=WITHIN)
             assert (incoming.payload, error.code) == (b"", RefusalCode.TOO_LARGE)
-            assert ("stop takes effect nevertheless" in error.message) == (name == "cmd/eve/stop")
+            assert ("stop is carried out nevertheless" in error.message) == (name == "cmd/eve/stop")
             assert inbox._budget.held - before == OVERHEAD * (name == "cmd/eve/stop")
         (stop,) = inbox.next_messages(9)
         assert stop.key == "trirail/demo/cmd/eve/stop"

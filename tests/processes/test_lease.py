@@ -77,7 +77,7 @@ def test_a_holder_that_dies_or_hangs_is_a_controlled_stop_and_the_lease_is_free(
             state = until(ann, lambda state: state.lease is None)
             state = until(ann, lambda state: state.mode == "holding")
             assert 0.0 < state.pose[0] < 0.09
-            assert told(ann, 2)[-1] == ("lease of bob is over: no sign of life for 3 s", None)
+            assert told(ann, 2)[-1] == ("lease of bob has expired: it was not renewed within 3 s", None)
             with refused_as(RefusalCode.NO_LEASE):
                 ann.move_to(x=0.0, y=0.0, phi=0.0)
             with ann.lease(timeout=LONG):
@@ -107,7 +107,7 @@ def gateway_lost_for_longer_than_a_lease(service: Service) -> None:
             until(ann, lambda state: state.mode == "holding" and state.lease is None)
             assert told(ann, 2) == [
                 ("lease acquired by ann", "ann"),
-                ("lease of ann is over: no sign of life for 2 s", None),
+                ("lease of ann has expired: it was not renewed within 2 s", None),
             ]
             with ann.lease(timeout=LONG):
                 assert ann.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"

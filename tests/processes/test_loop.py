@@ -229,7 +229,7 @@ def test_a_frozen_gateway_is_a_controlled_stop_that_says_so(shell: Shell) -> Non
     assert shell.mode() is Mode.HOLDING
     events = shell.events()
     assert [event.message for event in events if event.level == "warning"] == [
-        "the gateway is frozen, no sign of life for 0.3 s: controlled stop"
+        "the gateway is frozen, without a sign of life for 0.3 s: controlled stop"
     ]
     assert [(event.id, event.outcome) for event in events if event.outcome] == [("g-1", "stopped")]
 
@@ -364,7 +364,7 @@ def test_that_nothing_is_recorded_stands_in_the_status_while_it_is_so(shell: She
     assert len(told) <= MAX_TEXT
     assert "\x1b" not in told
     shell.recorder.close()
-    assert standing() == ["the recorder has gone: nothing is recorded until it is back"]
+    assert standing() == ["the recorder has died: nothing is recorded until it has restarted"]
     shell.recorder = links.connect(shell.folder / "recorder")
     shell.cycles(60)
     shell.recorder.send(message(Announcement(Notice("service", "info", "recording to y.rrd"))))

@@ -140,7 +140,7 @@ def test_a_service_does_not_start_with_poses_that_cannot_be_used(place: Place, w
     if wrong == "state":
         (place.state / "demo").mkdir(parents=True)
         (place.state / "demo/poses.json").write_text('{"far": [0.3, 0.0', encoding="utf-8")
-        said = "poses.json: Input data was truncated; mend it, or move it away and teach the poses again"
+        said = "poses.json: Input data was truncated; repair the file, or move it away and teach the poses again"
     else:
         text = place.config.read_text(encoding="utf-8").replace("park = [0.0, ", "park = [0.4, ")
         place.config.write_text(text, encoding="utf-8")

@@ -86,7 +86,7 @@ def asked(session: zenoh.Session, key: str, **what: object) -> list[tuple[str, s
         (json.dumps(POSE | {"x": 1e300}), "", "malformed", "<= 1000"),
         (msgspec.msgpack.encode(POSE | {"x": math.nan}), boundary.MSGPACK, "malformed", ">= -1000"),
         (json.dumps(POSE | {"id": "x" * 65}), "", "malformed", "length <= 64"),
-        *((json.dumps(POSE | {"id": name}), "", "malformed", "for control or formatting") for name in UNSEEN),
+        *((json.dumps(POSE | {"id": name}), "", "malformed", "without control and formatting") for name in UNSEEN),
         (json.dumps(POSE | {"\x1b[2J": 0}), "", "malformed", r"unknown field \x1b[2J"),
     ],
 )
@@ -140,14 +140,14 @@ def test_the_content_of_commands(shared: tuple[Service, Robot, zenoh.Session]) -
     key = "trirail/demo/cmd/eve/{}".format
     for percent in (1e-310, 0.5, -1.0, 201.0, 1e300, "1"):
         ((code, message),) = asked(session, key("override"), payload=json.dumps({"percent": percent}))
-        assert (code, message[:14]) == ("malformed", "override takes")
+        assert (code, message[:16]) == ("malformed", "override accepts")
     assert asked(session, key("override"))[0][0] == "malformed"
     packed = msgspec.msgpack.encode({"percent": 100})
     assert asked(session, key("override"), payload=packed, encoding=boundary.MSGPACK)[0][0] == "ok"
     for content in (b"", b"{}", b"null"):
         assert asked(session, key("stop"), payload=content)[0][0] == "ok"
         until(robot, lambda state: state.mode == "holding")
-    assert "takes no content" in asked(session, key("pause"), payload=b'{"a":' * 5000)[0][1]
+    assert "accepts no content" in asked(session, key("pause"), payload=b'{"a":' * 5000)[0][1]
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_a_stop_that_cannot_be_read_stops_the_robot_all_the_same(
     until(robot, lambda state: state.mode == "moving")
     ((found, message),) = asked(session, f"trirail/demo/cmd/eve/{name}", payload=payload, encoding=encoding)
     assert found == code
-    assert message.endswith(f"; {name} takes effect nevertheless")
+    assert message.endswith(f"; {name} is carried out nevertheless")
     assert goal.wait(WITHIN).outcome in ("stopped", "faulted")
     until(robot, lambda state: state.mode == {"stop": "holding", "quick_stop": "fault", "disable": "disabled"}[name])
     if name == "quick_stop":
@@ -232,7 +232,9 @@ def test_an_override_that_is_none_is_refused_in_a_line(shared: tuple[Service, Ro
             robot.override(percent)
     refused = trirail("override", 0.5, locator=service.locator)
     assert refused.returncode == 2
-    assert refused.stderr.startswith("trirail: Invalid value for PERCENT: '0.5' is no override: 0, or 1 to 200 %")
+    assert refused.stderr.startswith(
+        "trirail: Invalid value for PERCENT: '0.5' is not an override: use 0, or 1 to 200 %"
+    )
 
 
 # ---------------------------------------------------------------------- each is answered once

@@ -217,7 +217,7 @@ def test_a_disk_that_takes_nothing_is_told_and_the_pose_stays_what_it_was(
     asked.teach("pick", record((0.0, 0.0, 0.0)))
     (refusal,) = asked.refusals
     assert refusal.code is RefusalCode.FAILED
-    assert str(refusal) == "pick is as it was: poses.json: No space left on device"
+    assert str(refusal) == "pose pick is unchanged: poses.json: No space left on device"
     assert asked.known() == {"pick": POSE}
 
 
@@ -323,7 +323,9 @@ def test_a_name_that_the_configuration_takes_later_is_the_configuration_s_and_to
     asked.teach("park")
     later = make(PARKED)
     assert later.known() == {"park": (0.0, 0.05, 0.0)}
-    assert later.poses.warnings() == ("pose park is that of [poses]; the taught one is not used: trirail forget park",)
+    assert later.poses.warnings() == (
+        "pose park is defined in [poses], and the taught pose is not used: remove it with trirail forget park",
+    )
     later.ask("forget", "park")
     later.write()
     assert later.poses.warnings() == ()
@@ -334,7 +336,9 @@ def test_what_cannot_be_read_ends_the_start(make: Make) -> None:
     folder = state_directory("demo")
     folder.mkdir()
     (folder / "poses.json").write_text('{"pick": [0.0, 0.0')
-    with pytest.raises(ServiceError, match=r"poses\.json: .*mend it, or move it away and teach the poses again"):
+    with pytest.raises(
+        ServiceError, match=r"poses\.json: .*repair the file, or move it away and teach the poses again"
+    ):
         make(CONFIG)
 
 
@@ -352,7 +356,7 @@ def test_a_gateway_that_is_started_again_goes_on_without_what_cannot_be_read_and
         later = make(PARKED, again=True)
         assert later.known() == PARKED.poses
         (warning,) = later.poses.warnings()
-        assert "; there are no taught poses now; the file is kept as " in warning
+        assert "; no taught poses are available now; the file is kept as " in warning
         for later.now in (0.0, 100.0):
             later.poses.poll()
         assert uncoded(later.told) == [Notice("service", "warning", warning)]
@@ -407,7 +411,7 @@ def test_travels_are_those_of_the_inverse_kinematics(pose: tuple[float, float, f
         ("park = [0.5, 0.0, 0.0]", "poses.park = [0.5, 0, 0]: x would be 0.5, outside limits.platform.x = [-0.15, "),
         ("park = [0.0, 0.0]", "poses.park = [0.0, 0.0]: expected array of length 3"),
         ("park = [0.0, 0.0, 9.0]", "poses.park[2] = 9.0: expected number, -6.28319 to 6.28319"),
-        ("'my pose' = [0.0, 0.0, 0.0]", "poses: 'my pose' is no name here: expected text matching"),
+        ("'my pose' = [0.0, 0.0, 0.0]", "poses: 'my pose' is not a valid name here: expected text matching"),
         ("park = [0.0, 0.0, nan]", "poses.park[2] = nan: it must be a finite number"),
     ],
 )

@@ -100,7 +100,10 @@ def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub
     with service.robot() as robot:  # local control does not need it
         robot.enable()
         moving = robot.move_to(x=-0.02, y=0.0, phi=0.0)
-        lost = f"no link to the router {hub.locator}: connection refused; it is dialled again, local control continues"
+        lost = (
+            f"no link to the router {hub.locator}: connection refused; the connection is retried, and local control "
+            "continues"
+        )
         assert next(state for state in robot.states(WITHIN) if state.warnings).warnings == (lost,)
         hub.start()
         assert moving.wait(WITHIN).outcome == "done"

@@ -13,7 +13,7 @@ from trirail.processes.zenoh_links import DIAGNOSIS_PERIOD_S, ROUTER_GRACE_S, Ro
 from trirail.wire.messages import Notice
 
 HUB = "tls/192.0.2.9:7447"
-DOWN = f"no link to the router {HUB}: connection refused; it is dialled again, local control continues"
+DOWN = f"no link to the router {HUB}: connection refused; the connection is retried, and local control continues"
 
 
 class Net:

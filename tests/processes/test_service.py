@@ -152,7 +152,7 @@ def until(robot: Robot, condition: Callable[[State], bool]) -> State:
         if condition(state):
             return state
         assert time.monotonic() < deadline, state
-    raise AssertionError("the service has gone silent")
+    raise AssertionError("the service no longer sends its state")
 
 
 def told(robot: Robot, enough: Callable[[list[Event]], bool]) -> list[Event]:
@@ -287,7 +287,7 @@ def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_pat
     lines = f'\neds = "{eds}"\naccept_without = ["1006"]\n'
     with Service(tmp_path, **{f"[drives.{name}]\n": f"[drives.{name}]{lines}" for name in "BC"}) as service:
         service.wait_up()
-        words = "its watch on SYNC; without: it continues without SYNC"
+        words = "its monitoring of SYNC; without: it continues without SYNC"
         said = trirail("doctor", tmp_path / "robot.toml", "--quick").stdout
         assert f"drives B, C may lack 1006, {words}" in said
         assert f"drive B, drive C: 1006, {words}" in trirail("status", locator=service.locator).stdout
@@ -314,7 +314,7 @@ def test_the_commands(service: Service) -> None:
     assert "holding" in call("status").stdout
     out = call("goto", 0.5, 0, 0)
     assert out.returncode == 1
-    assert "platform x: position 500 mm is beyond its limit 150 mm" in out.stderr
+    assert "platform x: position 500 mm is beyond the limit of 150 mm" in out.stderr
     assert call("reset").returncode == 1
     assert call("goto", "nan", 0, 0).returncode == 2
     assert call("goto", 1, 2).returncode == 2
@@ -388,7 +388,7 @@ def test_bad_commands(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     _, robot, session = shared
     (reply,) = session.get("trirail/demo/cmd/eve/dance")
     assert reply.err is not None
-    assert "no such command; there are enable" in reply.err.payload.to_string()
+    assert "use one of enable" in reply.err.payload.to_string()
     (reply,) = session.get("trirail/demo/cmd/*/stop")
     assert reply.err is not None
     assert "contains a wildcard" in reply.err.payload.to_string()
@@ -585,7 +585,7 @@ def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> 
             until(robot, lambda state: state.settled)
             far = trirail("goto", 0.006, -0.004, 0.02, "--wait", locator=lagging.locator)
             assert far.returncode == 1
-            assert "unsettled: not in position 0.3 s after the end of its path; residuals: slider A " in far.stdout
+            assert "unsettled: not in position 0.3 s after the end of the path; residuals: slider A " in far.stdout
             said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
             assert (said["outcome"], said["settle"]) == ("unsettled", None)
             assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0
@@ -644,7 +644,7 @@ def test_a_view_is_drawn_from_what_the_service_publishes(shared: tuple[Service, 
     assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
     refused = trirail("view", "--web", locator=service.locator)
     assert refused.returncode == 1
-    assert "trirail view --records draws one here" in refused.stderr
+    assert "use trirail view --records, which draws" in refused.stderr
 
 
 def test_the_service_is_seen_alive(shared: tuple[Service, Robot, zenoh.Session]) -> None:
@@ -735,7 +735,7 @@ def test_a_planner_that_is_lost_costs_a_goal_and_no_more(service: Service, harm:
     assert service.end() == 0
     assert_stopped_smoothly(service.frames())
     log = service.log.read_text()
-    assert "the motion under way continues, new goals are refused; starting it again" in log
+    assert "the motion in progress continues, and new goals are refused; restarting it" in log
     assert "Traceback" not in log
 
 
@@ -799,12 +799,12 @@ def test_a_recorder_that_cannot_begin_again_never_ends_the_service(service: Serv
         folder.write_bytes(b"")
         os.kill(service.child("recorder"), signal.SIGKILL)
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
-        service.wait_said("the recorder has died (exit code 78): the robot is not affected; starting it again")
+        service.wait_said("the recorder has died (exit code 78): the robot is not affected; restarting it")
         folder.unlink()
         assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         said = (event.message for event in robot.events(history=True, timeout=WITHIN) if "record" in event.message)
         begun, gone, back = itertools.islice(said, 3)
-    assert gone == "the recorder has gone: nothing is recorded until it is back"
+    assert gone == "the recorder has died: nothing is recorded until it has restarted"
     assert begun.startswith(f"recording to {folder}/")
     assert back.startswith(f"recording to {folder}/")
     assert service.end() == 0
@@ -836,7 +836,9 @@ def test_killed_drives_are_a_fault_and_the_service_stays(service: Service) -> No
         os.kill(service.child("drives"), signal.SIGKILL)
         state = until(robot, lambda state: state.mode == "fault")
         (fault,) = state.faults
-        assert re.fullmatch(r"CAN bus .* is down: cannot (send|receive): .*listening end( of the bus)? is gone", fault)
+        assert re.fullmatch(
+            r"CAN bus .* is down: cannot (send|receive): .*listening end( of the bus)? has closed the connection", fault
+        )
         service.wait_said(
             "the simulated drives have died (killed by SIGKILL): the robot is in fault; restart the "
             "service to restart them"
@@ -902,7 +904,9 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> N
             in_motion(robot)
             os.kill(service.child("loop"), signal.SIGKILL)
         assert service.process.wait(END_WITHIN) == 1
-        assert "the loop is dead (killed by SIGKILL): the drives stop by their own watchdogs" in service.log.read_text()
+        assert (
+            "the loop has died (killed by SIGKILL): the drives stop by their own watchdogs" in service.log.read_text()
+        )
         stopped: dict[str, str] = {}
         while len(stopped) < 3:
             line = drives.stdout.readline().decode()

@@ -60,7 +60,7 @@ def test_outputs_are_set_by_client_and_command_line(service: Service, robot: Rob
     robot.disable()
     until(robot, lambda state: state.mode == "disabled")
     with pytest.raises(
-        RefusedError, match="output 'valve' keeps its safe value, off, while the robot is disabled"
+        RefusedError, match="output 'valve' stays at its safe value, off, while the robot is disabled"
     ) as refused:
         robot.set_output("valve", True)
     assert refused.value.code is RefusalCode.NOT_ENABLED
@@ -116,7 +116,7 @@ def test_marks_that_cannot_be_are_refused_and_nothing_moves(robot: Robot) -> Non
     before = robot.state().commanded.position
     for marks, what in (
         ([{"output": "pump", "after_start": 0.01}], "there is no output 'pump': the robot has valve, lamp"),
-        ([{"output": "valve", "after_start": 0.5}], "is at after_start = 500 mm; the path has 20 mm"),
+        ([{"output": "valve", "after_start": 0.5}], "is at after_start = 500 mm; the path is 20 mm long"),
     ):
         with pytest.raises(RefusedError, match=what):
             robot.move_to(x=0.02, y=0.0, phi=0.0, marks=marks)

@@ -145,7 +145,7 @@ def test_a_role_does_what_it_may_and_is_told_of_the_rest(served: Served, name: s
             does, f"cmd/{name}/{does}"
         )
         assert caught.value.code is RefusalCode.NOT_ALLOWED
-        assert str(caught.value) == f"{name} is {role} at demo: {key} needs {needed}"
+        assert str(caught.value) == f"{name} is {role} at robot demo: {key} needs the role {needed}"
         assert len(loop.asked) == before
 
 
@@ -155,7 +155,7 @@ def test_who_has_no_role_does_nothing_and_is_told(served: Served, name: str, doe
     with robot(served, name) as asking, pytest.raises(RefusedError) as caught:
         DOES[does](asking)
     assert caught.value.code is RefusalCode.NOT_ALLOWED
-    said = f"{name} has no role at demo: [zenoh.users] does not list this user, or it is revoked"
+    said = f"{name} has no role at robot demo: [zenoh.users] does not list the user, or the user is revoked"
     assert str(caught.value) == said
 
 
@@ -317,8 +317,8 @@ def test_an_open_door_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(("tcp/0.0.0.0:7447",), insecure=True))
     (said,) = Guard(config).warnings()
     assert (
-        said
-        == "insecure: everyone who reaches tcp/0.0.0.0:7447 can move the robot; trirail keys init makes certificates"
+        said == "insecure: anyone who can reach tcp/0.0.0.0:7447 can move the robot; "
+        "make certificates with trirail keys init"
     )
     loop = {"lacking": [], "bus_load": 0.1}
     ready: dict[str, dict[str, Any]] = {

@@ -302,7 +302,7 @@ def test_an_address_that_is_taken_is_told_with_the_remedy_and_the_service_goes_o
     guard = Guard(config)
     with socket.create_server(address.where):
         door = guard.stop_door(lambda *_: None)
-        assert any(f"no door for stops at {address}" in warning for warning in guard.warnings())
+        assert any(f"no stop port at {address}" in warning for warning in guard.warnings())
         door.close()
     guard.stop_door(lambda *_: None).close()
     assert not any("no door" in warning for warning in guard.warnings())
@@ -315,7 +315,7 @@ def test_a_port_that_the_configuration_needs_for_more_is_not_taken() -> None:
     telemetry = msgspec.structs.replace(CONFIG.telemetry, live_port=int(address.where[1]))
     guard = Guard(msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=listen), telemetry=telemetry))
     door = guard.stop_door(lambda *_: None)
-    assert any("where [telemetry] listens" in warning for warning in guard.warnings())
+    assert any("which [telemetry] uses" in warning for warning in guard.warnings())
     door.close()
 
 

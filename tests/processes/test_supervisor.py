@@ -130,8 +130,9 @@ def test_a_hung_gateway_is_killed_and_started_again(run: Running) -> None:
     )
     assert run.told[:2] == [
         "up",
-        "the gateway has died (no sign of life for 0.7 s, so it was killed): the loop stops the robot and holds; "
-        "starting it again",
+        "the gateway has died (no sign of life for 0.7 s, so it was killed): the loop stops the robot and holds its "
+        "position; "
+        "restarting it",
     ]
 
 
@@ -154,14 +155,15 @@ def test_a_frozen_loop_ends_the_service(run: Running) -> None:
         gateway_1=TURNING,
     )
     assert run.told[1] == (
-        "the loop is dead (no sign of life for 0.7 s, so it was killed): the drives stop by their own watchdogs; ending"
+        "the loop has died (no sign of life for 0.7 s, so it was killed): the drives stop by their own watchdogs; the "
+        "service ends"
     )
 
 
 @pytest.mark.parametrize(
     ("name", "silent", "consequence"),
     [
-        ("planner", 0.7, "the motion under way continues, new goals are refused"),
+        ("planner", 0.7, "the motion in progress continues, and new goals are refused"),
         ("recorder", 5, "the robot is not affected"),
     ],
 )
@@ -178,7 +180,7 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
     run.ends(1, **children)
     assert run.told[:2] == [
         "up",
-        f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; starting it again",
+        f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; restarting it",
     ]
 
 
@@ -195,14 +197,15 @@ def test_those_that_end_because_the_loop_ends_are_not_started_again(run: Running
     )
     assert run.told == [
         "up",
-        "the loop is dead (another process sent it SIGTERM): it has stopped the robot and disabled the drives; ending",
+        "the loop has died (another process sent it SIGTERM): the loop has stopped the robot and disabled the drives; "
+        "the service ends",
     ]
 
 
 @pytest.mark.usefixtures("patient")
 def test_a_loop_that_has_not_begun_has_stopped_nothing(run: Running) -> None:
     run.ends(1, loop_1="os.kill(os.getpid(), 15)", gateway_1="freeze()", recorder_1="freeze()")
-    assert run.told == ["the loop is dead (killed by SIGTERM): it had not begun; ending"]
+    assert run.told == ["the loop has died (killed by SIGTERM): the loop had not started; the service ends"]
 
 
 def test_a_first_start_is_waited_for_as_long_as_it_compiles(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,7 +217,7 @@ for number in range({FUNCTIONS}):
 """
     end = "ready(); beat_until(lambda: begun('up')); heartbeats.heart('loop').rest()"
     run.ends(1, loop_1=compiling + end, gateway_1=SERVING)
-    assert run.told[0].startswith(f"the first start compiles the mathematics, {FUNCTIONS} functions; once")
+    assert run.told[0].startswith(f"the first start compiles {FUNCTIONS} functions, which takes")
     assert run.told[1:4] == [f"compiling: {-(-FUNCTIONS * part // 4)} of {FUNCTIONS} functions" for part in (1, 2, 3)]
     assert run.told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]
 
@@ -236,7 +239,7 @@ def test_a_start_that_is_interrupted_has_not_failed(sent: str, run: Running) -> 
     """SIGTERM ends the children before they have said what it is to do."""
     interrupting = f"os.kill({os.getpid()}, signal.{sent}); freeze()"
     run.ends(0, loop_1=interrupting, gateway_1="freeze()", recorder_1="freeze()")
-    assert run.told == [f"{sent}: the start is interrupted, nothing has moved"]
+    assert run.told == [f"{sent}: the start was interrupted; nothing has moved"]
 
 
 def test_who_does_not_end_is_a_failure_also_of_a_start_that_is_interrupted(run: Running) -> None:
@@ -258,8 +261,8 @@ def test_a_frozen_fork_server_ends_the_service_when_a_child_is_wanted(
     )
     assert run.told[:3] == [
         "up",
-        "the gateway has died (exit code unknown): the loop stops the robot and holds; starting it again",
-        "the process that forks the others has died (no sign of life for 0.5 s, so it was killed): the loop stops the "
+        "the gateway has died (exit code unknown): the loop stops the robot and holds its position; restarting it",
+        "the process that starts the others has died (no sign of life for 0.5 s, so it was killed): the loop stops the "
         "robot and disables the drives; ending",
     ]
 
@@ -290,7 +293,7 @@ def test_drives_that_end_since_the_loop_lets_go_of_them_are_not_told(run: Runnin
         gateway_1=TURNING,
         drives_1="ready(); time.sleep(0.1)",
     )
-    assert run.told == ["the loop is dead (exit code 1): it had not begun; ending"]
+    assert run.told == ["the loop has died (exit code 1): the loop had not started; the service ends"]
 
 
 def test_an_end_while_a_recorder_is_started_again_is_in_order(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -337,5 +340,5 @@ def test_a_real_bus_has_no_process_of_drives(run: Running) -> None:
 def test_a_runtime_folder_of_somebody_else_is_refused_in_words(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     """As `su` leaves it to another user."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(run.folder / "gone"))
-    with pytest.raises(ServiceError, match=r"sockets in .*gone, the XDG_RUNTIME_DIR: .*; unset that, or set"):
+    with pytest.raises(ServiceError, match=r"sockets in .*gone \(XDG_RUNTIME_DIR\): .*; unset XDG_RUNTIME_DIR, or set"):
         run.ends(1)

@@ -83,7 +83,7 @@ def test_an_operator_moves_it_from_the_command_line(served: Served) -> None:
             "ok": False,
             "error": "RefusedError",
             "code": "not_allowed",
-            "message": "ann is operator at demo: cmd/ann/reset needs maintainer",
+            "message": "ann is operator at robot demo: cmd/ann/reset needs the role maintainer",
         },
     )
 

@@ -90,7 +90,7 @@ def test_what_is_missing_is_named_when_its_time_is_over_and_all_memory_is_free_a
     assert len(incoming.alike) + 1 == len(sent) - len(lost)
     assert refusal.code == "expired"
     assert f"part{'s' if len(lost) > 1 else ''} {min(lost) + 1}" in str(refusal)
-    assert f"of {len(sent)} did not come within {PARTS_WITHIN:g} s" in str(refusal)
+    assert f"of {len(sent)} not received within {PARTS_WITHIN:g} s" in str(refusal)
     del incoming
     rig.refused.clear()
     assert rig.budget.held == 0
@@ -100,8 +100,11 @@ def test_what_is_missing_is_named_when_its_time_is_over_and_all_memory_is_free_a
 def test_a_part_that_does_not_go_with_the_others_is_refused_and_says_why() -> None:
     sent = parts(trajectory(random.Random(0), 3 * MAX_PART))
     for other, problem in (
-        (sent[0], "part 1 has come already"),
-        (msgspec.structs.replace(sent[1], part=TrajectoryPart(2, 4)), "part 2 is of 4, the others are of 3"),
+        (sent[0], "part 1 has already been received"),
+        (
+            msgspec.structs.replace(sent[1], part=TrajectoryPart(2, 4)),
+            "part 2 states a total of 4 parts, the other parts state 3",
+        ),
         (msgspec.structs.replace(sent[1], stretch=not sent[1].stretch), "part 2 has other options"),
     ):
         rig = Rig()
@@ -118,7 +121,9 @@ def test_more_points_than_may_be_are_refused_with_the_part_that_has_them() -> No
     each = parts(trajectory(random.Random(0), number * MAX_PART))
     for part in each[:-1]:
         rig.add(part)
-    with pytest.raises(RefusedError, match=f"part {number} makes {number * MAX_PART} points: at most {MAX_POINTS}"):
+    with pytest.raises(
+        RefusedError, match=f"part {number} makes {number * MAX_PART} points in total, the maximum is {MAX_POINTS}"
+    ):
         rig.add(each[-1])
 
 

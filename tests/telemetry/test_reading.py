@@ -191,7 +191,7 @@ def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
         tmp_path: "a folder; expected a regular file",
         text: "not a recording: an RRD file begins with RRF2",
         empty: "not a recording: an RRD file begins with RRF2",
-        cut: "holds no",
+        cut: "contains no",
     }.items():
         with pytest.raises(ServiceError, match=f"^{re.escape(str(path))}: {why}") as raised:
             read(path)
@@ -200,7 +200,7 @@ def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
 
 def test_a_recording_without_records_is_told_as_what_it_is(tmp_path: Path) -> None:
     written(tmp_path / "a.rrd", made.records(0.1)[:0])
-    with pytest.raises(EmptyRecordingError, match=r"a\.rrd: nothing was recorded: its service ended before"):
+    with pytest.raises(EmptyRecordingError, match=r"a\.rrd: the recording is empty, because the service ended before"):
         read(tmp_path / "a.rrd")
 
 
@@ -208,7 +208,7 @@ def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:
     with rr.RecordingStream("another") as stream:
         stream.save(tmp_path / "a.rrd")
         stream.log("here", rr.Scalars(1.0))
-    with pytest.raises(ServiceError, match=r"a\.rrd: holds no records of cycles"):
+    with pytest.raises(ServiceError, match=r"a\.rrd: contains no records of cycles"):
         read(tmp_path / "a.rrd")
 
 

@@ -116,7 +116,7 @@ def test_a_recording_whose_file_is_taken_away_goes_on_in_another_and_says_so(how
             recording.save()
             assert recording.lost == 0
             assert (recording.path == before) is (how == "")
-            assert [words.partition(" has been deleted or moved")[0] for words in told] == [
+            assert [words.partition(" was deleted or moved")[0] for words in told] == [
                 *([str(log_of(recording, folder))] if how == "folder" else []),
                 *([str(before)] if how else []),
             ]
@@ -150,7 +150,7 @@ def test_a_folder_that_cannot_be_made_again_is_said_and_tried_again(tmp_path: Pa
     assert recording.unrecorded == ("", "")
     recording.close()
     assert f"the recording continues in {recording.path}" in told[1]
-    assert told[2].startswith(f"recorded again; missing data: {recording.lost} batches")
+    assert told[2].startswith(f"recording resumed; missing data: {recording.lost} batches")
     assert len(told) == 3
     assert read(recording.path).records["cycle"][-1] == len(sent) - 1
 
@@ -294,7 +294,7 @@ def test_the_recorder_tidies_its_folder(tmp_path: Path) -> None:
     feed(recording, made.records(0.1), time)
     recording.close()
     assert parts(tmp_path) == [recording.path]
-    assert told == [f"deleted, since all recordings take more than telemetry.keep_mb = 2: {old.name}"]
+    assert told == [f"old recordings deleted, because all recordings exceed telemetry.keep_mb = 2: {old.name}"]
 
 
 # ---------------------------------------------------------------------- disks that fail, and kills
@@ -316,7 +316,7 @@ def test_a_full_disk_is_told_of_once_and_once_when_it_is_well_again(
     recording.close()
     assert [words.partition(":")[0] for words in told] == [
         "nothing is recorded",
-        "recorded again; missing data",
+        "recording resumed; missing data",
     ]
     assert f"{tmp_path} is full: 10 MB are free" in told[0]
     assert f"{recording.lost} batches in the file" in told[1]

@@ -160,8 +160,8 @@ def test_sessions_are_found_by_what_was_in_them(shelf: Path, options: list[str],
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--fault", "zzz"], "0 sessions\nno recorded fault says zzz: there are emcy 0x8700\n"),
-        (["--fault", "0x8611"], "0 sessions\nno recorded fault says 0x8611: there are emcy 0x8700\n"),
+        (["--fault", "zzz"], "0 sessions\nno recorded fault contains zzz; known faults: emcy 0x8700\n"),
+        (["--fault", "0x8611"], "0 sessions\nno recorded fault contains 0x8611; known faults: emcy 0x8700\n"),
         (["--fault", "emcy", "--user", "max"], "0 sessions\n"),
     ],
 )
@@ -174,7 +174,7 @@ def test_a_fault_that_never_was_is_told_with_those_that_were(
 
 @pytest.mark.parametrize("words", ["0xzzz", "0x87000000000"])
 def test_a_code_that_no_fault_can_have_is_refused(shelf: Path, words: str) -> None:
-    with pytest.raises(CycloptsError, match=f"{words}' is no code such as 0x8700"):
+    with pytest.raises(CycloptsError, match=f"{words}' is not a code such as 0x8700"):
         app(["sessions", str(shelf), "--fault", words], exit_on_error=False, print_error=False)
 
 
@@ -249,7 +249,7 @@ def test_a_recorder_that_cannot_write_beside_its_recording_says_so_and_records(t
     sidecar(recording.path).mkdir()
     recording.records(made.records(0.1).tobytes())
     recording.close()
-    assert ["cannot be written, trirail sessions reads the recording" in words for words in told] == [True]
+    assert ["cannot be written, so trirail sessions reads the recording" in words for words in told] == [True]
     assert read_contents(recording.path).cycles == 100
 
 

@@ -17,4 +17,4 @@ with Robot(*robot_and_locator) as robot, open(file, "w", newline="", encoding="u
         rows.writerow([state.t, state.mode, *state.pose, *state.sliders.following_error, goal])
         if state.t >= begin + float(seconds):
             sys.exit(0)
-    sys.exit("the service has gone silent")
+    sys.exit("the service no longer sends its state")

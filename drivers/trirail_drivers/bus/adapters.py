@@ -33,7 +33,7 @@ def missing_support(interface: str) -> str:
     library, product = _LIBRARIES.get(interface, ("", ""))
     if library and find_library(library) is None:
         return (
-            f"{product} (lib{library}.so), which is not installed; Linux knows these adapters without it: "
+            f"{product} (lib{library}.so), which is not installed; on Linux, these adapters work without it: "
             'interface = "socketcan", channel = "can0"'
         )
     return ""

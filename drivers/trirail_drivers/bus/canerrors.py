@@ -26,7 +26,7 @@ _LENGTH = 8
 
 _CLASSES = {
     0x001: "a frame was not sent in time",
-    0x020: "no acknowledgement: no other node hears us; are the drives powered, and on the same bitrate?",
+    0x020: "no acknowledgement from any other node; check that the drives are powered and have the same bitrate",
     BUS_OFF: (
         "bus-off: 256 transmit errors, the controller has left the bus; check cable, termination and bitrate, then "
         "restart the interface: ip link set DEV down, ip link set DEV up"
@@ -137,16 +137,17 @@ def explain(error: Exception, *, sending: bool = True) -> str:
     reason = " ".join(str(error).split())
     if sending and queue_is_full(error):
         return (
-            f"{reason}: the transmit queue is full, because no node acknowledges (are the drives powered? check cable, "
+            f"{reason}: the transmit queue is full, because no node acknowledges (check the power of the drives, "
+            "cable, "
             f"termination, bitrate) or it is shorter than a cycle's frames: ip link set DEV txqueuelen 100"
         )
     match error_number(error):
         case errno.ENETDOWN:
             return f"{reason}: the interface is down; bring it up: ip link set DEV up"
         case errno.ENODEV | errno.ENXIO:
-            return f"{reason}: the interface is gone; is the adapter still plugged in?"
+            return f"{reason}: the interface no longer exists; check that the adapter is plugged in"
         case errno.EPIPE | errno.ECONNRESET:
-            return f"{reason}: the listening end of the bus is gone"
+            return f"{reason}: the listening end of the bus has closed the connection"
     return reason
 
 

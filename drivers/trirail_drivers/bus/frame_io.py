@@ -122,7 +122,7 @@ class SocketFrames:
         except ConnectionError:  # the other end died before it had read all frames
             size = 0
         if size != CAN_FRAME.size:  # 0 means end of file on a SOCK_SEQPACKET socket
-            raise can.CanOperationError("the listening end is gone")
+            raise can.CanOperationError("the listening end has closed the connection")
         identifier, length = HEADER.unpack_from(packet)
         return identifier, packet[DATA_AT : DATA_AT + (0 if identifier & REMOTE else length)]
 

@@ -116,4 +116,4 @@ def send_in_setup(bus: FrameSender, frame: Frame) -> None:
     except (can.CanError, OSError) as error:
         if canerrors.queue_is_full(error):
             return
-        raise BusError(f"cannot send on {bus.channel_info}: {error}; is the interface up?") from error
+        raise BusError(f"cannot send on {bus.channel_info}: {error}; check that the interface is up") from error

@@ -55,7 +55,7 @@ class Traffic:
 def warning(rate_hz: float, load: float) -> str:
     """Return a warning if the bus load exceeds HIGH_LOAD, otherwise ""."""
     return (
-        f"CAN bus: {rate_hz:g} Hz takes {load:.0%} of it at worst; keep below {HIGH_LOAD:.0%}"
+        f"CAN bus: {rate_hz:g} Hz takes up to {load:.0%} of the bus; keep the load below {HIGH_LOAD:.0%}"
         if load > HIGH_LOAD
         else ""
     )

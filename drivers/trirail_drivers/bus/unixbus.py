@@ -49,13 +49,13 @@ class UnixBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
         """Send a frame to the peers. Raises can.CanOperationError if the listening end is gone or too slow."""
         if msg.is_fd:
-            raise can.CanOperationError(f"{self.channel_info}: classical CAN frames only, not CAN FD")
+            raise can.CanOperationError(f"{self.channel_info}: CAN FD frames cannot be sent; use classical CAN frames")
         packet = packed(msg)
         if self._listener is None:
             try:
                 next(iter(self._peers.values())).send(packet)
             except (StopIteration, OSError) as error:
-                raise can.CanOperationError(f"{self.channel_info}: cannot send, {error!r}") from error
+                raise can.CanOperationError(f"{self.channel_info}: cannot send: {error!r}") from error
         else:
             self._relay(packet)
 
@@ -93,7 +93,10 @@ class UnixBus(can.BusABC):
     def _listen(self) -> socket.socket:
         with contextlib.suppress(OSError):
             _connect(self._path).close()
-            raise BusError(f"{self.channel_info}: another process listens there; stop it or use another path")
+            raise BusError(
+                f"{self.channel_info}: another process already listens on this socket; stop that process or use "
+                "another path"
+            )
         if self._path.is_socket():
             self._path.unlink()  # left behind by a process that died
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
@@ -121,7 +124,7 @@ class UnixBus(can.BusABC):
             del self._peers[peer.fileno()]
             peer.close()
             if self._listener is None:
-                raise can.CanOperationError(f"{self.channel_info}: the listening end is gone")
+                raise can.CanOperationError(f"{self.channel_info}: the listening end has closed the connection")
             return
         self._relay(packet, peer)
         self._arrived.append(unpacked(packet, time.time()))
@@ -153,5 +156,7 @@ def _connect(path: Path) -> socket.socket:
 
 def _remedy(path: Path, listen: bool) -> str:
     if listen:
-        return f"unix {path}: cannot listen there; is the folder writable, the path under 108 bytes?"
+        return (
+            f"unix {path}: cannot listen there; check that the folder is writable and the path shorter than 108 bytes"
+        )
     return f"unix {path}: no process listens there; start tools/virtual_drives.py --interface unix --channel {path}"

@@ -113,7 +113,7 @@ class Wire:
 
     def _end_trial(self) -> None:
         self.down, self._trial, self._awaits_frame = "", None, False
-        self._warnings.append(f"CAN bus {self._name} is back")
+        self._warnings.append(f"CAN bus {self._name} is up again")
 
     def _use(self, bus: can.BusABC) -> None:
         """Replace the bus."""

@@ -30,7 +30,7 @@ STANDSTILL_TIME_S = 0.1
 RESET_TIME = 2 * canopen_frames.STATUS_PERIOD
 """Longest time until a drive leaves the fault state after a fault reset [s]: two periods of its statusword."""
 
-_RESTARTED = "has restarted and lost its set-up: wait until it is configured again, then send reset"
+_RESTARTED = "has restarted and lost its set-up: wait until the drive is configured again, then send reset"
 _NMT_STATES = {canopen_frames.STOPPED: "stopped", canopen_frames.PRE_OPERATIONAL: "pre-operational"}
 _STATE_BITS = 0x6F
 """Bits of a statusword that encode the state."""
@@ -305,7 +305,7 @@ class Cia402Axis(Axis):
             self.note_fault("frame", 0, warning(self.node, "each SYNC has two positions"))
         if mistaken is not None:
             self.restarted = self.left_operational = self.pdo_silent = False
-            by = "one has booted, or is not operational, while the other sends positions"
+            by = "one node has booted, or is not operational, while the other sends positions"
             self.event = self.make_fault("frame", 0, warning(self.node, by))
         return mistaken
 
@@ -352,7 +352,7 @@ class Cia402Axis(Axis):
                 self._answers_after.begin(self.event)
         elif self._operational:  # otherwise the drive sent the heartbeat before it was started
             self.leave_operational()
-            self.note_fault("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
+            self.note_fault("state", 0, f"has left NMT operational and is {_NMT_STATES.get(state, f'in {state:02X}')}")
             self._answers_after.begin(self.event)
         self.pdo_silent = self.left_operational and self.configured and state != canopen_frames.OPERATIONAL
 
@@ -446,7 +446,7 @@ class Cia402Axis(Axis):
             and wanted is PowerState.OPERATION_ENABLED
             and self.state is not PowerState.OPERATION_ENABLED
         ):
-            return self.make_fault("state", 0, f"left operation enabled by itself: it is {self.state}")
+            return self.make_fault("state", 0, f"has left operation enabled by itself and is {self.state}")
         else:
             return self._following_fault(now, wanted)
         return None
@@ -457,7 +457,7 @@ class Cia402Axis(Axis):
         CiA 402-2 defines this bit for modes 7 and 8.
         """
         if (waited := self.mode.waited(now, awaited=self.awaits_mode)) is not None:
-            return self.make_fault("state", 0, f"shows no mode (object 6061) {waited:.3g} s after it got power")
+            return self.make_fault("state", 0, f"shows no mode (object 6061) {waited:.3g} s after it was enabled")
         enabled = wanted is self.state is PowerState.OPERATION_ENABLED
         meant_to = enabled and self.cyclic and self.mode.shown and self.exchange.tells_following
         if not meant_to or self.statusword & canopen_frames.FOLLOWS_SETPOINTS:
@@ -469,6 +469,6 @@ class Cia402Axis(Axis):
             self._unfollowed_since = now
         if not self._followed and now - self._unfollowed_since <= FOLLOW_TIME:
             return None
-        text = f"does not follow setpoints: bit 12 of its statusword {self.statusword:04X} is clear"
-        never = "" if self._followed else '; if it never sets that bit, set accept_without = ["6041"]'
+        text = f"does not follow setpoints: bit 12 of statusword {self.statusword:04X} is clear"
+        never = "" if self._followed else '; if the drive never sets bit 12, set accept_without = ["6041"]'
         return self.make_fault("state", 0, text + never)

@@ -301,7 +301,7 @@ def _check(name: str, of_file: Origin, of_drive: Origin, *, replace: bool) -> No
             continue
         if theirs is not None and field in ("device_type", "vendor", "product"):
             raise DriveError(
-                f"drive {name}: its {field} is {format_number(mine)}, the file's {format_number(theirs)}; "
+                f"drive {name}: its {field} is {format_number(mine)}, but the file has {format_number(theirs)}; "
                 "use a file for the same product"
             )
         others.append(f"{field} {format_number(mine)} (the file's {format_number(theirs)})")
@@ -316,7 +316,7 @@ async def _check_without_power(remote: Remote) -> None:
     state = canopen_frames.power_state(statusword)
     if state in _POWERED:
         raise DriveError(
-            f"drive {remote.name}: parameters are only restored without power; its state is "
+            f"drive {remote.name}: parameters can only be restored while the drive has no power; its state is "
             f"{state or 'none of CiA 402'} (statusword {statusword:04X})"
         )
 

@@ -49,13 +49,13 @@ def _check_eds(name: str, drive: Drive) -> None:
         eds.load(name, Path(drive.eds or ""), drive.node)
     except DriveError as error:
         raise DriveError(
-            f"drives.{name}.eds = {drive.eds!r}: {error}; correct the name or the file, or leave it out"
+            f"drives.{name}.eds = {drive.eds!r}: {error}; correct the name or the file, or omit the key"
         ) from error
 
 
 def _check_endpoints(name: str, drive: Drive) -> None:
     if drive.endpoints is not None:
-        raise DriveError(f"drives.{name}.endpoints = {drive.endpoints}: only ODrives have endpoints; leave it out")
+        raise DriveError(f"drives.{name}.endpoints = {drive.endpoints}: only ODrives have endpoints; omit the key")
 
 
 def _check_window(name: str, drive: Drive, drives: Drives) -> None:

@@ -134,7 +134,7 @@ _CLASSES = {
     0x87: "SYNC",
     0x90: "external error",
     0xF0: "additional function",
-    0xFF: "the maker's own",
+    0xFF: "manufacturer-specific",
 }
 """Error classes by the upper byte of the code or, if this byte is not listed, by the first digit of the code."""
 

@@ -61,7 +61,7 @@ async def _write(drive: Differences, key: Key, value: int, bits: int, why: str) 
     try:
         await remote.write(*key, value)
     except SdoRefused as refusal:
-        raise DriveError(f"{refusal}; it is needed for [outputs] of drive {remote.name}") from refusal
+        raise DriveError(f"{refusal}; this is needed for [outputs] of drive {remote.name}") from refusal
     drive.note(key, current, value, why)
     if key == MASK:
         held, _ = await remote.wait_until(key, lambda held: held == value)
@@ -75,6 +75,7 @@ def _refuse_differing(drive: Differences, key: Key, held: int | None, wanted: in
         return
     names = ", ".join(str(bit) for bit in range(32) if differing >> bit & 1)
     raise DriveError(
-        f"drive {drive.remote.name}: {title(key)} stays {shown(*key, held)}, expected {shown(*key, wanted)}: its maker "
-        f"reserves bit {names}; use other bits in [outputs], from its maker's manual"
+        f"drive {drive.remote.name}: {title(key)} stays {shown(*key, held)}, expected {shown(*key, wanted)}: the "
+        "manufacturer "
+        f"reserves bit {names}; use other bits in [outputs], as in the manufacturer's manual"
     )

@@ -161,7 +161,7 @@ def _read(file: Path, node: int) -> tuple[ObjectDictionary, list[str]]:
         objects = canopen.import_od(_text(file, sound), node)
     if not len(objects):
         reason = notes[0] if notes else "it has no objects"
-        raise DriveError(f"{file} is not an EDS as CiA 306 has it: {reason}")
+        raise DriveError(f"{file} is not an EDS according to CiA 306: {reason}")
     return objects, notes
 
 

@@ -150,7 +150,7 @@ class HomingSequence:
         axis.seen_clear = ~axis.statusword
         if not self._stopping:
             axis.mode_bits = canopen_frames.HOMING_START
-            yield from self._wait_until(lambda: self._stopping or _attained(axis), timeout, "home was not attained")
+            yield from self._wait_until(lambda: self._stopping or _attained(axis), timeout, "home was not reached")
         attained = _attained(axis)
         if not attained:
             yield from self._halt(axis)
@@ -170,14 +170,16 @@ class HomingSequence:
     def _follow_setpoints(self, axis: Cia402Axis) -> Steps:
         """Switch back to the setpoint mode once the drive's setpoint equals its actual position."""
         answered = axis.sampled + FRESH_ANSWERS
-        yield from self._wait_until(lambda: axis.sampled >= answered, self._sdo_timeout, "there was no new position")
+        yield from self._wait_until(
+            lambda: axis.sampled >= answered, self._sdo_timeout, "the drive sent no new position"
+        )
         standing = axis.actual
         yield
         # The control loop has received this position. From now on it sends this position, as this sequence did before.
         axis.held = standing
         axis.follows = True
         taken_up = axis.syncs + SETPOINT_SYNCS
-        yield from self._wait_until(lambda: axis.syncs >= taken_up, self._sdo_timeout, "there was no SYNC")
+        yield from self._wait_until(lambda: axis.syncs >= taken_up, self._sdo_timeout, "no SYNC was sent")
         yield from self._change_mode(axis, axis.exchange.mode)
         axis.cyclic = True
         axis.held = None

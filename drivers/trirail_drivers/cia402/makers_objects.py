@@ -12,8 +12,8 @@ from trirail_drivers.cia402.sdo import is_pdo
 from trirail_drivers.config import Drive, ObjectWrite
 from trirail_drivers.errors import DriveError
 
-_STORES: Final = "would store it in the drive, or restore what is stored"
-_ADDRESS: Final = "changes node id or bitrate: that is for its maker's tool"
+_STORES: Final = "would store parameters in the drive, or restore stored ones"
+_ADDRESS: Final = "changes node id or bitrate, for which the manufacturer's tool is needed"
 _FORBIDDEN: Final = {0x1010: _STORES, 0x1011: _STORES, 0x100B: _ADDRESS}
 _UNITS: Final = (0x60A9, 0x60AA)
 """Objects that are not in USES but that the set-up may write."""

@@ -25,7 +25,7 @@ async def choose_modes(remote: Remote, *, homes: bool) -> tuple[int, ...]:
     if modes is not None and homes and not modes >> (HOMING - 1) & 1:
         raise DriveError(
             f"drive {remote.name}: object 6502:00 (supported drive modes) is {modes:08X}, without homing mode; "
-            f"leave [drives.{remote.name}.homing] out if its encoder is absolute"
+            f"omit [drives.{remote.name}.homing] if its encoder is absolute"
         )
     available = []
     for mode in (CYCLIC_SYNCHRONOUS_POSITION, INTERPOLATED_POSITION):

@@ -48,13 +48,15 @@ class OtherMasters:
 
     def note_fault(self, cause: str, code: int, text: str) -> None:
         """Latch a fault, because another master has sent a malformed frame."""
-        self._wire.fail(DriveFault("", "bus", code, f"CAN bus: another master is on it: {text} ({cause})"))
+        self._wire.fail(DriveFault("", "bus", code, f"CAN bus: another master is on the bus: {text} ({cause})"))
 
     def _sends(self, text: str) -> Handler:
         return lambda data, now: self._warn(text)  # noqa: ARG005  one signature for all
 
     def _warn(self, text: str) -> None:
-        self._wire.fail(DriveFault("", "bus", 0, f"CAN bus: another master is on it: it {text}; only one is allowed"))
+        self._wire.fail(
+            DriveFault("", "bus", 0, f"CAN bus: another master is on the bus and {text}; only one master is allowed")
+        )
 
     def _on_nmt(self, data: bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         command, node = canopen_frames.NMT_COMMAND.unpack(data)
@@ -81,7 +83,7 @@ class ExclusiveBus(can.BusABC):
         self.inner = bus
         self.channel_info = bus.channel_info
         bases = {
-            canopen_frames.SDO_REQUEST: "asks drives by SDO",
+            canopen_frames.SDO_REQUEST: "accesses drives by SDO",
             canopen_frames.RPDO1: "sends PDOs",
             canopen_frames.RPDO2: "sends PDOs",
         }
@@ -102,10 +104,10 @@ class ExclusiveBus(can.BusABC):
             return frame
         text = self._masters.get(frame.arbitration_id, "")
         if frame.is_remote_frame and frame.arbitration_id in self._guarded:
-            text = "asks drives by node guarding"
+            text = "polls drives by node guarding"
         if text:
             raise DriveError(
-                f"another master is on the bus: it {text} (identifier {frame.arbitration_id:03X}); "
+                f"another master is on the bus and {text} (identifier {frame.arbitration_id:03X}); "
                 "stop the service (trirail run) or the other program"
             )
         return frame

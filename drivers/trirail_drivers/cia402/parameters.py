@@ -110,7 +110,7 @@ def encode(data_type: int, value: Value, where: str = "") -> bytes:
             return data
     except (AttributeError, OverflowError, TypeError, ValueError):
         pass
-    raise ValueError(f"{where}{value!r} is no value of data type {data_type:04X}h")
+    raise ValueError(f"{where}{value!r} is not a value of data type {data_type:04X}h")
 
 
 def _variable(data_type: int) -> ODVariable:

@@ -150,7 +150,8 @@ class Pdos:
         if (pdo := await self._first_fixed(TPDO, entries, ON_CHANGE)) is not None:
             return pdo.identifier
         raise DriveError(
-            f"drive {self._remote.name}: no TPDO takes its digital inputs 60FD; use inputs of another drive in [inputs]"
+            f"drive {self._remote.name}: its digital inputs 60FD cannot be mapped into a TPDO; use inputs of another "
+            "drive in [inputs]"
         )
 
     async def _first_fixed(self, base: int, entries: tuple[int, ...], kind: int) -> PdoParameters | None:

@@ -157,7 +157,7 @@ class Remote:
         if not size or not -1 << 8 * size - 1 <= value < 1 << 8 * size:
             raise SdoRefused(
                 f"drive {self.name}: cannot write {shown(*key, value)} to {self._called(key)}: "
-                f"it has {8 * size} bits; expected the standard's {8 * width(key)}",
+                f"it has {8 * size} bits, but {8 * width(key)} bits in the standard",
                 TOO_LONG,
             )
         return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
@@ -234,7 +234,9 @@ class Remote:
         except NoAnswerError as error:
             raise DriveTimeout(self.name, f"answer for {called}", self.client.timeout) from error
         except BootedError as error:
-            raise RestartedError(f"drive {self.name}: restarted during its set-up; check its power supply") from error
+            raise RestartedError(
+                f"drive {self.name}: the drive restarted during its set-up; check its power supply"
+            ) from error
         except SdoCommunicationError as error:
             raise DriveError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
         except (can.CanError, OSError) as error:

@@ -140,7 +140,7 @@ class Client:
             raise NoAnswerError("no answer")
         answer = bytes(frame.data)
         if frame.arbitration_id == canopen_frames.HEARTBEAT + self.node:
-            raise BootedError("it has restarted")
+            raise BootedError("the drive has restarted")
         self.answered += 1
         if answer[0] >> 5 == _ABORT:
             raise SdoAbortedError(int.from_bytes(answer[4:], "little"))

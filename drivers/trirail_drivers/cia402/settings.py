@@ -34,8 +34,8 @@ def interpolation_periods(period: float) -> list[tuple[int, int]]:
     finest = max(-6, math.ceil(math.log10(period / 255)))
     nearest = max(1, round(period * 10**-finest)) * 10.0**finest
     raise DriveError(
-        f"a cycle of {period:g} s ({1 / period:g} Hz) is not possible: object 60C2h takes "
-        f"1 to 255 times a power of ten from 1 us; the nearest is {nearest:g} s ({1 / nearest:g} Hz)"
+        f"a cycle of {period:g} s ({1 / period:g} Hz) is not possible: object 60C2h accepts "
+        f"1 to 255 times a power of ten, from 1 us; the nearest is {nearest:g} s ({1 / nearest:g} Hz)"
     )
 
 
@@ -45,7 +45,7 @@ def check_nodes(drives: Drives) -> None:
     nodes["drives.master_node"] = drives.master_node
     for key, node in nodes.items():
         if node == 0:
-            raise DriveError(f"{key} = 0: on CANopen that addresses all nodes; expected 1 to 127")
+            raise DriveError(f"{key} = 0: on CANopen, 0 addresses all nodes; use 1 to 127")
     if len(set(nodes.values())) < len(nodes):
         listed = ", ".join(f"{key} = {node}" for key, node in nodes.items())
         raise DriveError(f"node ids must differ, but are {listed}")
@@ -55,7 +55,7 @@ def heartbeat_period_ms(drives: Drives) -> int:
     """Return the heartbeat period [ms]. Raises DriveError if a drive cannot accept it."""
     heartbeat = round(1000 * drives.heartbeat)
     if not 1 <= 3 * heartbeat <= 0xFFFF or heartbeat < 1:
-        raise DriveError(f"heartbeat {drives.heartbeat:g} s: a drive takes 0.001 to 21.845 s")
+        raise DriveError(f"drives.heartbeat = {drives.heartbeat:g} s: a drive accepts 0.001 to 21.845 s")
     return heartbeat
 
 

@@ -148,7 +148,8 @@ def check_identifiers(done: Sequence[SetUp]) -> None:
             if identifier in owners:
                 raise DriveError(
                     f"drives {owners[identifier]} and {made.name}: both have a PDO with identifier {identifier:03X}h "
-                    f"that cannot be changed (1400:01, 1800:01 and on); give each its own with its maker's tool"
+                    "that cannot be changed (1400:01, 1800:01 and on); give each drive its own identifier with the "
+                    "manufacturer's tool"
                 )
             owners[identifier] = made.name
 

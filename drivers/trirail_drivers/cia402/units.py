@@ -150,7 +150,7 @@ def parse_unit(key: str, text: str, power: int) -> Unit:
         if power == 1
         else ("accelerations", '"counts/s2", "rpm/s", "rev/s2", "deg/s2", "rad/s2", "mm/s2"')
     )
-    raise DriveError(f'{key} = "{text}" is not a unit of {kind}; use one such as {shown}')
+    raise DriveError(f'{key} = "{text}" is not a unit of {kind}; use a unit such as {shown}')
 
 
 def check(name: str, drive: Drive, key: Literal["velocity_unit", "acceleration_unit"]) -> None:
@@ -213,8 +213,8 @@ def _check_known(name: str, quantity: str, per_metre: float) -> None:
     if math.isnan(per_metre):
         index, example = ("60A9", "counts/s") if quantity == "velocity" else ("60AA", "counts/s2")
         raise DriveError(
-            f"drive {name}: does not report its unit of {quantity} (object {index}); look it up in its manual, and set "
-            f'drives.{name}.{quantity}_unit, as "{example}"'
+            f"drive {name}: does not report its unit of {quantity} (object {index}); find it in the manual, and set "
+            f'drives.{name}.{quantity}_unit, such as "{example}"'
         )
 
 
@@ -224,5 +224,5 @@ def _unsigned(name: str, key: str, value: float, per_si: float, unit: str) -> in
     """
     exact = per_si * value
     if not 0.5 < exact < UINT32_MAX - 0.5:
-        raise DriveError(f"drive {name}: {key} {value:g} is {exact:g} {unit}; a drive takes 1 to {UINT32_MAX - 1}")
+        raise DriveError(f"drive {name}: {key} {value:g} is {exact:g} {unit}; a drive accepts 1 to {UINT32_MAX - 1}")
     return round(exact)

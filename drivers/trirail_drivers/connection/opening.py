@@ -43,7 +43,7 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
         return UnixBus(section.channel)
     if section.interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted({"simulated", "unix", *can.VALID_INTERFACES}))
-        raise BusError(f'can.interface "{section.interface}" is unknown; known are {known}')
+        raise BusError(f'can.interface "{section.interface}" is unknown; use one of {known}')
     options: dict[str, Any] = dict(section.options)
     try:
         # ignore_config: python-can's own files and environment variables must not change the configured bus.

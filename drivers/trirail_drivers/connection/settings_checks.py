@@ -51,28 +51,30 @@ def files(drives: Drives) -> Iterator[Rule]:
 def _check_bitrate(section: Can) -> None:
     if section.bitrate > MAX_CLASSICAL_BITRATE and section.interface not in _OWN_INTERFACES:
         raise DriveError(
-            f"can.bitrate = {section.bitrate}: classical CAN ends at {MAX_CLASSICAL_BITRATE} bit/s; "
-            f"only {' and '.join(_OWN_INTERFACES)}, which have no wire, go beyond"
+            f"can.bitrate = {section.bitrate}: the maximum of classical CAN is {MAX_CLASSICAL_BITRATE} bit/s; "
+            f"only {' and '.join(_OWN_INTERFACES)}, which have no wire, may exceed it"
         )
 
 
 def _check_option(section: Can, name: str) -> None:
     if section.interface in _OWN_INTERFACES:
-        raise DriveError(f'can.options.{name}: "{section.interface}" has no options, python-can\'s interfaces have')
+        raise DriveError(
+            f'can.options.{name}: "{section.interface}" has no options; only interfaces of python-can have options'
+        )
     if name in _RESERVED_OPTIONS:
-        raise DriveError(f"can.options.{name}: not an option; set interface, channel and bitrate in [can]")
+        raise DriveError(f"can.options.{name}: not allowed here; set interface, channel and bitrate in [can]")
 
 
 def _check_io(key: str, protocol: str) -> None:
     if reason := PROTOCOLS[protocol].without_io:
-        raise DriveError(f'{key}: not with drives.protocol = "{protocol}": {reason}; leave the section out')
+        raise DriveError(f'{key}: not with drives.protocol = "{protocol}": {reason}; omit the section')
 
 
 def _check_heartbeat(drives: Drives, required: Requirements) -> None:
     if drives.heartbeat < required.period:
         raise DriveError(
-            f"drives.heartbeat = {drives.heartbeat:g}: heartbeats go out with the cycle; "
-            f"expected at least its period, {required.period:g} s"
+            f"drives.heartbeat = {drives.heartbeat:g}: heartbeats are sent with the cycle; "
+            f"expected at least the period, {required.period:g} s"
         )
 
 

@@ -123,7 +123,7 @@ def _receive(bus: can.BusABC, seconds: float) -> can.Message | None:
     try:
         return bus.recv(max(0.0, seconds))
     except (can.CanError, OSError) as error:
-        raise BusError(f"cannot receive on {bus.channel_info}: {error}; is the interface up?") from error
+        raise BusError(f"cannot receive on {bus.channel_info}: {error}; check that the interface is up") from error
 
 
 async def read_until(

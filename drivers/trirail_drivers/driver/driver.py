@@ -109,7 +109,7 @@ class Driver(ABC, Generic[AnyAxis]):
         elif away := [axis.name for axis in self._axes if axis.silent]:
             one, *more = away
             text = f"drives {', '.join(away)} do not answer" if more else f"drive {one} does not answer"
-            self._wire.fail(DriveFault("" if more else one, "silent", 0, f"{text}; switch the supply on"))
+            self._wire.fail(DriveFault("" if more else one, "silent", 0, f"{text}; switch on the supply"))
 
     def _recover(self) -> None:
         """Continue the recovery of drives.

@@ -143,9 +143,9 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
         answered = self.client.answered if self.client is not None else 0
         if not answered and not axis.restarted:
             return Unready(f"{name} does not answer")
-        reason = "restarted" if axis.restarted else "is back"
+        reason = "has restarted" if axis.restarted else "answers again"
         if blocked:
-            return Unready(f"{name} {reason}: it is configured when no drive has power")
+            return Unready(f"{name} {reason}: the drive is configured once no drive has power")
         return Unready(f"{name} {reason}: {self.work}", answered, self.requests, self.counted)
 
 

@@ -56,7 +56,7 @@ def review_protections(
     for name, reason in missing_protections.items():
         if name in accepted:
             used = protections[name]
-            notes.append(f"lacks {name} ({used.purpose}): {reason}; accepted, so {used.without}")
+            notes.append(f"lacks {name} ({used.purpose}): {reason}; this is accepted: {used.without}")
     if not refused:
         return "", notes
     what = "; ".join(f"{name}, {protections[name].purpose}: {missing_protections[name]}" for name in refused)
@@ -84,8 +84,7 @@ def replacement_refusal(
         return ""
     remedy = "" if allowed else f", or set drives.{drive}.allow_replacement = true"
     return (
-        f"drive {drive}: another drive is in its place: {', '.join(differing)}; "
-        f"restart the service to accept it{remedy}"
+        f"drive {drive}: the drive has been replaced: {', '.join(differing)}; restart the service to accept it{remedy}"
     )
 
 
@@ -96,7 +95,7 @@ def raise_combined(errors: Sequence[DriveError]) -> None:
     alike: dict[str, list[str]] = {}
     for error in errors:
         alike.setdefault(_NAMED.sub(r"\1_", str(error)), []).append(str(error))
-    texts = [first + "".join(f"; drive {_name(text)}: the same" for text in more) for first, *more in alike.values()]
+    texts = [first + "".join(f"; the same for drive {_name(text)}" for text in more) for first, *more in alike.values()]
     if texts:
         raise DriveError("; ".join(shortened(text, MAX_MESSAGE_LENGTH // len(texts) - 2) for text in texts))
 

@@ -99,5 +99,5 @@ def _check_window(name: str, step: float, window: Window) -> None:
     if window.width < least:
         raise DriveError(
             f"{window.key} = {window.width:g}: narrower than {MIN_STEPS_PER_WINDOW} position steps of drive {name}, "
-            f"{step:g} m each; expected at least {least:g} {window.unit}, to settle in"
+            f"{step:g} m each; expected at least {least:g} {window.unit} to settle in"
         )

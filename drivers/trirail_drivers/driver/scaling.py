@@ -43,6 +43,6 @@ def scale_of(name: str, drive: Drive) -> Scale:
     if abs(zero) > INT32_MAX:
         raise DriveError(
             f"drive {name}: counts_per_metre {drive.counts_per_metre:g} and offset {drive.offset:g} m put "
-            f"slider position 0 beyond a drive's 32-bit counts; set a smaller offset or fewer counts"
+            f"slider position 0 outside the range of 32-bit counts; set a smaller offset or fewer counts"
         )
     return scale

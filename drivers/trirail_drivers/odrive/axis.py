@@ -123,7 +123,7 @@ class OdriveAxis(Axis):
         if math.isfinite(turns):
             self.position = self.scale.metres(turns)
         else:
-            self.note_fault("frame", 0, f"position estimate is {turns}: has its encoder been calibrated?")
+            self.note_fault("frame", 0, f"position estimate is {turns}; check that its encoder has been calibrated")
 
     def on_errors(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """Handle Get_Error: active errors and disarm reason."""
@@ -193,7 +193,7 @@ class OdriveAxis(Axis):
             text = f"runs {cansimple.state_name(self.state)}, which the service did not request"
             return self.make_fault("state", 0, text)
         if follows and self.powered_up and self.state != AxisState.CLOSED_LOOP_CONTROL:
-            text = f"left closed loop control by itself: it is in {cansimple.state_name(self.state)}"
+            text = f"has left closed loop control by itself and is in {cansimple.state_name(self.state)}"
             return self.make_fault("state", 0, text)
         return None
 
@@ -222,7 +222,9 @@ class OdriveAxis(Axis):
         self._started, self.state = False, AxisState.UNDEFINED
         self.restarted, self.boots = True, self.boots + 1
         # This replaces an earlier event, which the restart explains.
-        self.event = self.make_fault("state", 0, "has restarted: wait until its settings are checked, then send reset")
+        self.event = self.make_fault(
+            "state", 0, "has restarted: wait until its settings have been checked, then send reset"
+        )
 
     def _watch_refusal(self) -> None:
         if self._result in (ProcedureResult.SUCCESS, ProcedureResult.BUSY):

@@ -19,9 +19,9 @@ _FLOAT_DIGITS: Final = 23
 """Number of fraction bits in an ODrive position, which is a 32-bit float."""
 
 _CANOPEN_ONLY: Final = {
-    "homing": "homing is CiA 402's, an ODrive must know its position at power-on; leave the table out",
-    "eds": "an ODrive has no object dictionary; leave it out",
-    "write": "an ODrive has no object dictionary; leave it out",
+    "homing": "homing is CiA 402's, an ODrive must know its position at power-on; omit the table",
+    "eds": "an ODrive has no object dictionary; omit the key",
+    "write": "an ODrive has no object dictionary; omit the key",
 }
 
 

@@ -51,7 +51,7 @@ PROTECTIONS: Final = {
     "endpoints": Protection("the endpoint numbers of its settings", "none of them is checked"),
     "enable_watchdog": Protection("its stop when the host is silent", "it continues with the last setpoint"),
     "input_vel_scale": Protection("the unit of the velocity feed-forward", "the feed-forward has the wrong size"),
-    "heartbeat_msg_rate_ms": Protection("this service's watch on it", "its loss is seen late, or it loads the bus"),
+    "heartbeat_msg_rate_ms": Protection("monitoring by this service", "its loss is seen late, or it loads the bus"),
     "cyclic_messages": Protection("positions only in answer to requests", "positions of unknown age arrive"),
 }
 """Protections that `accept_without` may name for an ODrive."""

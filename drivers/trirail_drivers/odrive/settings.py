@@ -42,7 +42,7 @@ def _check_table(name: str, table: Mapping[str, Endpoint]) -> None:
     for path in SETTINGS:
         endpoint = table.get(path)
         if endpoint is None and path in REQUIRED:
-            raise DriveError(f"drives.{name}.endpoints: it lacks {path}; download it: {flat_endpoints.DOWNLOADS}")
+            raise DriveError(f"drives.{name}.endpoints: the file lacks {path}; download it: {flat_endpoints.DOWNLOADS}")
         if endpoint is not None and not (endpoint.type in cansimple.TYPES and 0 <= endpoint.id <= 0xFFFF):
-            problem = f"{path} is endpoint {endpoint.id} of type {endpoint.type!r}, which no message holds"
+            problem = f"{path} is endpoint {endpoint.id} of type {endpoint.type!r}, which fits in no message"
             raise DriveError(f"drives.{name}.endpoints: {problem}; download it: {flat_endpoints.DOWNLOADS}")

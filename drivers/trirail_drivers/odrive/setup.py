@@ -44,7 +44,7 @@ def check_nodes(drives: Drives) -> None:
     nodes = {f"drives.{name}.node": drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
     for key, node in nodes.items():
         if node not in cansimple.NODES:
-            raise DriveError(f"{key} = {node}: an ODrive has 0 to {cansimple.NODES[-1]}")
+            raise DriveError(f"{key} = {node}: the node id of an ODrive is 0 to {cansimple.NODES[-1]}")
     if len(set(nodes.values())) < len(nodes):
         raise DriveError(f"node ids must differ, but are {', '.join(f'{key} = {node}' for key, node in nodes.items())}")
 
@@ -147,7 +147,7 @@ async def configure_one(
     estimates = await client.request(cansimple.GET_ENCODER_ESTIMATES, "Get_Encoder_Estimates")
     turns, _ = _unpacked(client, cansimple.ESTIMATES, estimates)
     if not math.isfinite(turns):
-        raise DriveError(f"drive {name}: position estimate is {turns}: has its encoder been calibrated?")
+        raise DriveError(f"drive {name}: position estimate is {turns}; check that its encoder has been calibrated")
     relative = is_relative(read)
     notes += [RELATIVE] * relative
     made = OdriveSetup(name, OdriveIdentity(version, serial), relative, tuple(lacks), tuple(notes))

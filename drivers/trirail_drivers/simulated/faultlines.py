@@ -20,34 +20,34 @@ HELP: Final = """\
 [at SECONDS] [when DRIVE CONDITION] [with CHANCE] [DRIVE] FAULT [VALUE] [FRAMES ...] [for SECONDS | for N frames]
   at 2.5 A silent for 0.5        when B moving B emcy 4310        with 0.01 C drop tpdo2
 
-faults of frames, to and from a drive (FRAMES: all where none are named):
+faults of frames, to and from a drive (all frames if no FRAMES are named):
   drop · duplicate · corrupt (one bit) · delay SECONDS · dlc LENGTH
   FRAMES  to the drive: to, nmt sync rpdo1 rpdo2 rpdo3 sdo-request; from it: from, heartbeat, emcy tpdo1 tpdo2 tpdo3
           sdo-answer; an ODrive: set_axis_state set_controller_mode set_input_pos clear_errors position-request rxsdo;
           from it: get_version get_error get_encoder_estimates txsdo; or an identifier: 0x181
 faults of a drive:
-  silent            nothing is heard or sent      emcy CODE     an emergency, without more (hexadecimal)
+  silent            receives and sends nothing    emcy CODE     sends an emergency only (hexadecimal)
   fault CODE        breaks down with an EMCY      reboot        loses its supply and its set-up
-  stuck             the slider does not move      lag SECONDS   the slider is so far behind
-  runaway SPEED     the slider moves with SPEED [m/s] whatever it is told, until it has no power
+  stuck             the slider does not move      lag SECONDS   the slider follows late
+  runaway SPEED     the slider moves at SPEED [m/s] regardless of setpoints, until the drive has no power
 faults of its digital outputs and inputs, by their BIT in 60FEh and 60FDh:
   output-stuck BIT  keeps its state         input-bounces BIT  for 5 ms after each edge
-  reserves BIT      is the maker's: it cannot be switched, and is not in the mask that is read back
-faults of its mechanics and wiring, as a rule beside the rail shows them:
-  reversed          the slider goes the other way         scale RATIO    it goes RATIO times as far as counted
-  swapped DRIVE     it moves that drive's slider          loose          its encoder does not turn with it
-  node ID           DRIVE's slider is moved by the drive of that node id, whatever is configured
-  counts NUMBER     what moves DRIVE's slider counts that per metre, below 0 where they fall as it rises, likewise
-  slips SHARE       its encoder misses that share of the way while the slider's position rises
-  against           its encoder counts against its motor: with power it runs away
+  reserves BIT      the manufacturer reserves BIT: it cannot be switched, and is clear in the mask when read back
+faults of its mechanics and wiring, as a ruler along the rail shows them:
+  reversed          the slider moves backwards            scale RATIO    it moves RATIO times as far as counted
+  swapped DRIVE     it moves the slider of DRIVE          loose          its encoder does not turn with the motor
+  node ID           the slider of DRIVE is moved by the drive with this node id, whatever is configured
+  counts NUMBER     the drive that moves the slider of DRIVE counts NUMBER per metre; below 0 if counts fall as it rises
+  slips SHARE       its encoder misses this share of the travel while the position of the slider rises
+  against           its encoder counts against its motor: when it has power, it runs away
   play METRES       between drive and slider: backlash
 faults of the bus (no DRIVE):
-  bus-off           the master's controller leaves the bus        error-passive   ... is about to
-  babble ID         a node sends this identifier without pause; what has a higher one does not get through
-DRIVE is A, B, C or all, by the sliders of [can.simulated] built, where that is there.
-CONDITION is enabled, moving, stopping or fault; DRIVE before it may be any.
-at     seconds after the line is read        for   how long; else until clear (emcy, fault, reboot: at once over)
-with   chance for each frame; for faults of a drive or the bus, for each second
+  bus-off           the master's controller leaves the bus        error-passive   the controller is close to bus-off
+  babble ID         a node sends this identifier without pause; frames with higher identifiers are blocked
+DRIVE is A, B, C or all; with [can.simulated] built, the letters are those of its sliders.
+CONDITION is enabled, moving, stopping or fault; the DRIVE before it may be any.
+at     seconds after the line is read        for   duration; else until clear (emcy, fault, reboot: momentary)
+with   chance per frame, or per second for faults of a drive or the bus
 Commands: list · clear (ends all faults) · help"""
 
 
@@ -199,7 +199,7 @@ class _FaultLineReader:
 
     def next_word(self, after: str, wants: str, example: str) -> str:
         if not self.left:
-            raise FaultSyntaxError(f"after {after} comes {wants}, as in: {example}")
+            raise FaultSyntaxError(f"{after} must be followed by {wants}, as in: {example}")
         return self.left.pop(0)
 
     def value(self, after: str, wants: str, example: str, read: Callable[[str], float]) -> float:
@@ -207,7 +207,7 @@ class _FaultLineReader:
         try:
             return read(word)
         except ValueError:
-            raise FaultSyntaxError(f"{after} {word}: after {after} comes {wants}, as in: {example}") from None
+            raise FaultSyntaxError(f"{after} {word}: {after} must be followed by {wants}, as in: {example}") from None
 
 
 def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
@@ -232,7 +232,7 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
         raise FaultSyntaxError(_unknown("fault", name, known))
     kind = _KINDS[name]
     if bool(drives) is (name in _OF_BUS):
-        right = "the bus: name no drive" if drives else f"a drive: name it, as in: A {name}"
+        right = "the bus: do not name a drive" if drives else f"a drive: name the drive, as in: A {name}"
         raise FaultSyntaxError(f"{name} is a fault of {right}")
     who = "A " if drives else ""
     value = words.value(name, kind.wants, f"{who}{name} {kind.example}", kind.read) if kind.read else 0.0
@@ -240,7 +240,7 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
     while words.left and not words.next_is("for"):
         word = words.left.pop(0)
         if name not in _OF_FRAMES:
-            raise FaultSyntaxError(f'"{word}" after {name}: only for can follow, as in: {who}{name} for 0.5')
+            raise FaultSyntaxError(f'"{word}" after {name}: only "for" may follow, as in: {who}{name} for 0.5')
         chosen.append(_frames(word, {**known_frames, **EITHER}))
     duration, number = _lasting(words, name, kind.momentary)
     return Fault(line, name, drives, value, tuple(chosen), delay, condition, chance, duration, number)
@@ -250,7 +250,7 @@ def _condition(words: _FaultLineReader) -> Condition:
     example = "when B moving A silent"
     drive = words.next_word("when", "A, B, C or any", example)
     if drive not in (*NAMES, "any"):
-        raise FaultSyntaxError(f"when {drive}: after when comes A, B, C or any, as in: {example}")
+        raise FaultSyntaxError(f"when {drive}: when must be followed by A, B, C or any, as in: {example}")
     state = words.next_word(f"when {drive}", ", ".join(CONDITIONS), example)
     if state not in CONDITIONS:
         raise FaultSyntaxError(_unknown("condition", state, CONDITIONS))
@@ -278,7 +278,7 @@ def _lasting(words: _FaultLineReader, name: str, momentary: bool) -> tuple[float
     if not words.left:
         return value, None
     if name not in _OF_FRAMES or words.left not in (["frames"], ["frame"]) or value != round(value) or value < 1:
-        raise FaultSyntaxError(f'"{" ".join(words.left)}" after for {value:g}: a line ends as in: {example}')
+        raise FaultSyntaxError(f'"{" ".join(words.left)}" after for {value:g}: the line must end as in: {example}')
     return math.inf, round(value)
 
 

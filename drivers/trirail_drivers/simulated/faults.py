@@ -126,7 +126,7 @@ class Faults:
         if fault.name in OF_PINS:
             for index in fault.drives:
                 if self._drives[index].pins is None:
-                    raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no digital outputs and inputs")
+                    raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no digital inputs or outputs")
         if self.idle:
             self._now = self._clock()
         self._active.append(_ActiveFault(fault, self._now))

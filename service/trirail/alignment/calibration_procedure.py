@@ -70,7 +70,7 @@ def calibrate_by_moves(
     yield LookReport("calibration", first)
     # The names of the marks are known after the first look. Check them before any move.
     if views is not None and (unknown := sorted(set(first.marks) - set(views))):
-        text = f"marks without a view: {', '.join(unknown)}; name one for each, views names {', '.join(views)}"
+        text = f"marks without a view: {', '.join(unknown)}; give each mark a view; views has {', '.join(views)}"
         yield LookReport("calibration", end=AlignmentFault.MISSING, words=text)
         raise AlignmentError(AlignmentFault.MISSING, text)
     for move in moves:

@@ -117,7 +117,9 @@ def calibrate(
     names = sorted({name for sample in samples for name in sample.marks})
     view_of = dict(views) if views is not None else {name: name for name in names}
     if unknown := [name for name in names if name not in view_of]:
-        raise AlignmentError(AlignmentFault.MISSING, f"marks without a view: {', '.join(unknown)}; name one for each")
+        raise AlignmentError(
+            AlignmentFault.MISSING, f"marks without a view: {', '.join(unknown)}; give each mark a view"
+        )
     if len(names) < 1:
         raise AlignmentError(AlignmentFault.MISSING, "no mark was found in any look; check light, focus and threshold")
     fits = {

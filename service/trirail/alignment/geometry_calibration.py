@@ -230,7 +230,9 @@ def start_model(task: GeometryTask, looks: Sequence[StageLook]) -> tuple[StageMo
     looks = [look._replace(marks={name: look.marks[name] for name in names if name in look.marks}) for look in looks]
     views = {name: name for name in names} if task.views is None else dict(task.views)
     if unknown := [name for name in names if name not in views]:
-        raise AlignmentError(AlignmentFault.MISSING, f"marks without a view: {', '.join(unknown)}; name one for each")
+        raise AlignmentError(
+            AlignmentFault.MISSING, f"marks without a view: {', '.join(unknown)}; give each mark a view"
+        )
     cameras = _first_calibration([CalibrationSample(look.pose, look.marks) for look in looks], views)
     middle = (task.field[0] / 2.0, task.field[1] / 2.0)
     started = {
@@ -262,7 +264,8 @@ def _first_calibration(samples: Sequence[CalibrationSample], views: Mapping[str,
             return min(right, key=lambda fit: fit.noise)
     raise failure or AlignmentError(
         AlignmentFault.STILL,
-        "the marks do not follow the first moves, of 1 mm and 1°; take a new picture at each look, and check the names",
+        "the marks do not follow the first moves, of 1 mm and 1°; take a new picture at each look, and check the names "
+        "of the marks",
     )
 
 
@@ -296,7 +299,9 @@ def _travel(task: GeometryTask) -> Floats:
         within &= inside & room.holds(travels(task.start, beyond), margin)
     reached: Floats = poses[within]
     if not len(reached):
-        raise AlignmentError(AlignmentFault.MOVES, "the limits and the approach leave the stage no pose to look at")
+        raise AlignmentError(
+            AlignmentFault.MOVES, "the limits and the approach leave no pose at which the stage can be observed"
+        )
     return reached
 
 

@@ -115,7 +115,10 @@ def measure_misalignment(
 def check_targets_known(calibration: CameraCalibration, targets: Marks) -> None:
     """Raise AlignmentError if a target belongs to a mark that is not in the calibration."""
     if unknown := sorted(set(targets) - set(calibration.marks)):
-        raise AlignmentError(AlignmentFault.MISSING, f"not in the calibration: {', '.join(unknown)}; calibrate with it")
+        raise AlignmentError(
+            AlignmentFault.MISSING,
+            f"marks not in the calibration: {', '.join(unknown)}; calibrate again with these marks",
+        )
 
 
 def _locate_marks(views: list[CameraView], seen: list[tuple[float, float]]) -> Floats:

@@ -68,14 +68,14 @@ def switches(recording: Recording) -> tuple[Switch, ...]:
 
 def _write(path: Path, make: Callable[[], pa.Table]) -> int:
     if path.suffix not in FORMATS:
-        raise ServiceError(f"{path}: its name must end in {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
+        raise ServiceError(f"{path}: the name must end in {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
     rows = make()
     try:
         # Mode "x" fails if the file exists, so that an earlier export is never overwritten.
         with path.open("xb") as file:
             _WRITERS[path.suffix](rows, file)
     except FileExistsError as error:
-        raise ServiceError(f"{path} exists already: name another file") from error
+        raise ServiceError(f"{path} already exists: choose another file") from error
     except OSError as error:
         raise ServiceError(f"cannot write {path}: {error.strerror or error}") from error
     return len(rows)

@@ -69,7 +69,7 @@ def write(recording: Recording, path: Path) -> int:
             count = _write_bag(Path(folder, "bag"), messages(recording, geometry))
             Path(folder, "bag/bag.mcap").replace(path)
     except FileExistsError as error:
-        raise ServiceError(f"{path} exists already: name another file") from error
+        raise ServiceError(f"{path} already exists: choose another file") from error
     except OSError as error:
         raise ServiceError(f"cannot write {path}: {error.strerror or error}") from error
     return count

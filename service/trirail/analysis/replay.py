@@ -206,14 +206,16 @@ def _check_recording(recording: Recording, records: NDArray[np.void], config: Co
     begins, cycle = MODES[int(records["mode"][0])], int(records["cycle"][0])
     if begins is not Mode.DISABLED:
         raise ServiceError(
-            f"the recording begins at cycle {cycle} in mode {begins}; a replay needs one that begins disabled. Give "
-            "all files of a rotated recording (-part2 and on). Nothing precedes a black box, or the file of a recorder "
-            "that was restarted: read these with trirail report and trirail export"
+            f"the recording begins at cycle {cycle} in mode {begins}; a replay needs a recording that begins in mode "
+            "disabled. Give all files of a rotated recording (-part2 and so on). A black box, or the file of a "
+            "recorder "
+            "that was restarted, cannot be replayed: read it with trirail report and trirail export"
         )
     rate = round(1.0 / float(np.median(np.diff(recording.t[:1000])))) if len(recording.t) > 1 else 0
     if rate and rate != config.loop.rate_hz:
         raise ServiceError(
-            f"loop.rate_hz: {config.loop.rate_hz} Hz, but the recording has {rate} cycles a second; set it to {rate}"
+            f"loop.rate_hz: {config.loop.rate_hz} Hz, but the recording has {rate} cycles per second; set loop.rate_hz "
+            f"to {rate}"
         )
 
 

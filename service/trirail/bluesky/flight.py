@@ -93,7 +93,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
             await link.mover.start(self._first).end
         async with self._sending:
             if self._stopped:  # stop() may have run during the await, which mypy cannot know
-                raise TrirailError("stopped before its goal was sent")
+                raise TrirailError("the motion was stopped before its goal was sent")
             if not self._has_marks:
                 self._sampling = asyncio.create_task(self._sample(link.robot))
                 self._sampling.add_done_callback(lambda task: task.cancelled() or task.exception())
@@ -111,7 +111,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         """
         goal = self._goal
         if goal is None:
-            raise TrirailError(f"{self.name}: complete before kickoff")
+            raise TrirailError(f"{self.name}: complete was called before kickoff")
         link = await self._stage.link()
         try:
             result = await link.mover.settle(goal)

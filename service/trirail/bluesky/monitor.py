@@ -30,7 +30,7 @@ class Monitored(Device):
         If the function is slow, it gets only the newest readings. Raises ValueError if it is already subscribed.
         """
         if function in self._monitors:
-            raise ValueError(f"{self.name}: {function!r} has been subscribed already; call clear_sub first")
+            raise ValueError(f"{self.name}: {function!r} is already subscribed; call clear_sub first")
         self._monitors[function] = asyncio.get_running_loop().create_task(self._monitor(function))
 
     subscribe = subscribe_reading

@@ -128,7 +128,7 @@ class Mover:
         repeats these sets when it resumes.
         """
         unsent, self._unsent, self._gathered = self._unsent, [], []
-        end_all(unsent, None if success else TrirailError("stopped before its goal was sent"))
+        end_all(unsent, None if success else TrirailError("the motion was stopped before its goal was sent"))
         async with self._sending:  # wait until the service has accepted a goal that is being sent
             motion = self._motion
         if motion is None or motion.goal.result is not None:

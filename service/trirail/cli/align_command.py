@@ -93,7 +93,7 @@ def calibrate(
     else:
         alignment_lines.show_calibration(calibration, file)
         if old is not None:
-            terminal.print_line(f"what was there is in {old}")
+            terminal.print_line(f"the previous file is now {old}")
     return 0
 
 
@@ -218,7 +218,7 @@ def _load_calibration(file: Path, service: Service) -> CalibrationFile:
 
     kept = calibration_file.read(file)
     if kept.robot != service.robot:
-        raise TrirailError(f"{file} is of robot {kept.robot}, not of {service.robot}: calibrate this one")
+        raise TrirailError(f"{file} is for robot {kept.robot}, not for robot {service.robot}: calibrate this robot")
     return kept
 
 
@@ -227,8 +227,9 @@ def _checked_calibration(kept: CalibrationFile, file: Path, geometry: str) -> Ca
     if kept.is_of_geometry(geometry):
         return kept.calibration
     terminal.print_error(
-        f"{file} was made with another geometry of the stage: calibrate again, or let an alignment confirm it; "
-        "its first correction is short until then"
+        f"{file} was made with another geometry of the stage: calibrate again, or let an alignment confirm the "
+        "calibration; "
+        "until then, the first correction of an alignment is shortened"
     )
     return msgspec.structs.replace(kept.calibration, confirmed=False)
 

@@ -80,7 +80,7 @@ def geometry(
 
     settings = load(config)
     if out is not None and out.exists():
-        raise ConfigError(f"{out} exists already; name another file with --out")
+        raise ConfigError(f"{out} already exists; choose another file with --out")
     way = approach[0], approach[1], notation.radians(approach[2], False)
     with source.open_source() as (look, known), service.open() as robot:
         _check_same(settings, config, robot)
@@ -119,9 +119,13 @@ def _check_same(settings: Config, path: Path, robot: Robot) -> None:
     from trirail.config.as_built import geometry_of
 
     if settings.robot.name != robot.name:
-        raise ConfigError(f"{path} is of robot {settings.robot.name}, not of {robot.name}: name it with --robot")
+        raise ConfigError(
+            f"{path} is for robot {settings.robot.name}, not for robot {robot.name}: select the robot with --robot"
+        )
     if geometry_of(config.geometry(settings.geometry)) != geometry_id(robot.info()):
-        raise ConfigError(f"{path}: its [geometry] is not that with which the service runs; name the service's file")
+        raise ConfigError(
+            f"{path}: [geometry] differs from that of the running service; give the file with which the service runs"
+        )
 
 
 def _usable_map(result: GeometryCalibration, settings: Config, *, quiet: bool) -> AsBuilt | None:
@@ -206,7 +210,7 @@ def _report(written: _Written, path: Path, remarks: list[str]) -> None:
     if written.map is not None:
         terminal.print_line(f"map: {written.map}")
     terminal.print_line(f"It takes effect when the service is started again: trirail run {written.config}")
-    terminal.print_line("Made with the geometry before:")
+    terminal.print_line("Made with the previous geometry:")
     for remark in remarks:
         terminal.print_line(f"  {remark}")
 

@@ -308,15 +308,15 @@ def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
     behind = words[words.index("--") :] if "--" in words else []
     unknown = error.token.keyword if isinstance(error, UnknownOptionError) else None
     if unknown and any(word.split("=")[0] == unknown for word in behind):
-        message = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
+        message = f"{unknown} follows --, after which options are not recognised; negative numbers need no --"
     elif isinstance(error, CoercionError) and error.msg and error.argument and not message.startswith("Invalid value"):
         message = f"Invalid value for {error.argument.name.strip('-')}: {message}"
     elif isinstance(error, UnusedCliTokensError):
         more = " ".join(quoted(word.strip()) for word in error.unused_tokens or ())
-        message = f"{more} {'is' if ' ' not in more else 'are'} more than it takes"
+        message = f"{more} {'is' if ' ' not in more else 'are'} more than the command takes"
         options = error.app.assemble_argument_collection() if error.app else ()
         if more.endswith(".toml") and any("--config" in option.names for option in options):
             message += f": a configuration is --config {more.split()[-1]}"
     by_command = type(error) is CycloptsError  # raised by the command itself, which does not know its name
     command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
-    return f"{message} ({command} --help tells the usage)"
+    return f"{message} ({command} --help shows the usage)"

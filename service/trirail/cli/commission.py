@@ -76,9 +76,9 @@ def commission(
     simulated = settings.can.interface == "simulated"
     if (yes or fault) and not simulated:
         option = "--yes" if yes else "--fault"
-        raise ConfigError(f"{option} is for simulated drives: a person must watch real ones")
+        raise ConfigError(f"{option} is only for simulated drives: a person must watch real drives")
     if out is not None and out.exists():
-        raise ConfigError(f"{out} exists already; name another file with --out")
+        raise ConfigError(f"{out} already exists; choose another file with --out")
     name = f"commission-{settings.robot.name}-{time.strftime('%Y%m%d-%H%M%S')}.json"
     made = reports.CommissioningReport(settings.robot.name, str(config), reports.now(), simulated, str(software()))
     keeper = reports.ReportFile(made, report or Path(name))

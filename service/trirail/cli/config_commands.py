@@ -64,7 +64,7 @@ def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
         with target.open("xb") as file, source.open("rb") as original:
             shutil.copyfileobj(original, file)
     except FileExistsError:
-        raise ConfigError(f"{target} exists already: name another file") from None
+        raise ConfigError(f"{target} already exists: choose another file") from None
     except OSError as error:
         raise ConfigError(f"{target}: {error.strerror}") from error
     if json:
@@ -125,7 +125,7 @@ def shipped_file(name: str) -> Path:
     for path in _shipped():
         if name in (_name(path), _name(path).removesuffix(".toml")):
             return path
-    raise ConfigError(f"no configuration {name!r} is shipped: there are {', '.join(map(_name, _shipped()))}")
+    raise ConfigError(f"no configuration {name!r} is shipped: use one of {', '.join(map(_name, _shipped()))}")
 
 
 def _tables(path: Path) -> _Tables:

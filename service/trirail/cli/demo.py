@@ -79,7 +79,7 @@ def run(name: str = "sim", *, stay: bool, record: Path | None) -> int:
     file = shipped_file(name)
     config = load(file)
     if config.can.interface != "simulated":
-        raise ConfigError(f"{file.name} has drives on {config.can.interface}: a demo moves simulated ones alone")
+        raise ConfigError(f"{file.name} has drives on {config.can.interface}: a demo moves only simulated drives")
     stamp = time.strftime("%Y%m%d-%H%M%S")
     recording = record or Path(config.telemetry.directory) / f"demo-{stamp}.rrd"
     locator = config.zenoh.listen[0]

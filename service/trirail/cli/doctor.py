@@ -23,8 +23,8 @@ from trirail.wire.vocabulary import Role
 def network(config: Config, machine: Machine) -> list[Check]:
     """Return the users that can command the robot at each endpoint, and the findings on certificates and users."""
     remedies = {
-        ReachableBy.MACHINE: "where others log in too: unixsock-stream/PATH lets in the socket's owner and group alone",
-        ReachableBy.NETWORK: "trirail keys init makes certificates for [zenoh.tls]",
+        ReachableBy.MACHINE: "if others log in here: unixsock-stream/PATH admits only the socket's owner and group",
+        ReachableBy.NETWORK: "create certificates for [zenoh.tls] with trirail keys init",
     }
     checks = []
     for endpoint in config.zenoh.listen:
@@ -38,7 +38,7 @@ def network(config: Config, machine: Machine) -> list[Check]:
         return [*checks, Check("certificates", "failure", machine.guard)]
     if machine.guard is not None:
         users = ", ".join(f"{user} {role}" for user, role in machine.guard.users.items())
-        checks.append(Check("users", "ok" if users else "warning", users or "none, so nobody can do anything"))
+        checks.append(Check("users", "ok" if users else "warning", users or "none: no user can command the robot"))
         warnings = machine.guard.certificate_warnings()
         checks += [Check("certificates", "warning", warning) for warning in warnings]
         checks += without_certificate(machine.guard.users, machine.issued)
@@ -52,7 +52,7 @@ def _connection_limits(config: Config, machine: Machine) -> list[Check]:
         return []
     if missing := ports - set(machine.limited_ports):
         listed = ", ".join(map(str, sorted(missing)))
-        remedy = f"trirail config copy trirail.nft, set its ports to {listed}, nft -f trirail.nft"
+        remedy = f"trirail config copy trirail.nft, set the ports in this file to {listed}, then nft -f trirail.nft"
         return [Check("firewall", "warning", f"one address can keep others from connecting to port {listed}", remedy)]
     return [Check("firewall", "ok", "limits the connections of one address")]
 
@@ -69,7 +69,7 @@ def without_certificate(users: Mapping[str, Role], issued: Sequence[IssuedCertif
                 Check(
                     "certificates",
                     "warning",
-                    f"{user} has a role and no certificate",
+                    f"{user} has a role but no certificate",
                     f"trirail keys add {user} --role {role}",
                 )
             )
@@ -80,7 +80,7 @@ def without_certificate(users: Mapping[str, Role], issued: Sequence[IssuedCertif
 
 def routers(links: Sequence[tuple[str, str]]) -> list[Check]:
     """Check the routers through which users connect; without routers, the robot serves local users only."""
-    remedy = "start the router there, or correct zenoh.connect, zenoh.router and certificates"
+    remedy = "start the router at this address, or correct zenoh.connect, zenoh.router and certificates"
     return [
         Check("router", "warning", f"{endpoint}: {why}", remedy)
         if why
@@ -99,7 +99,7 @@ def metrics(config: Config) -> list[Check]:
     if by is ReachableBy.NETWORK and config.zenoh.tls is not None:
         by = ReachableBy.CERTIFICATE
     verdict: Verdict = "warning" if by is ReachableBy.NETWORK else "ok"
-    remedy = "trirail keys init makes certificates for [zenoh.tls]" if by is ReachableBy.NETWORK else ""
+    remedy = "create certificates for [zenoh.tls] with trirail keys init" if by is ReachableBy.NETWORK else ""
     return [Check("metrics", verdict, f"{endpoint}: {by} can read them", remedy)]
 
 
@@ -162,15 +162,17 @@ def kernel(machine: Machine, *, simulated: bool) -> Check:
     release = f"{machine.release}, without PREEMPT_RT"
     if simulated:
         return Check("kernel", "ok", f"{release}: enough for simulated drives")
-    return Check("kernel", "warning", release, "for a bounded lateness boot one with it: Debian's linux-image-rt-amd64")
+    return Check(
+        "kernel", "warning", release, "to bound the lateness, boot a kernel with it: Debian's linux-image-rt-amd64"
+    )
 
 
 def rights(lacking: tuple[str, ...], realtime: str) -> Check:
     """Check that the loop gets the rights that loop.realtime requests."""
     if not lacking:
-        return Check("rights", "ok", "SCHED_FIFO, locked memory, a processor of its own")
+        return Check("rights", "ok", "SCHED_FIFO, locked memory, a dedicated processor")
     if realtime == "off":
-        return Check("rights", "warning", lacking[0], 'loop.realtime = "prefer" takes what it gets')
+        return Check("rights", "warning", lacking[0], 'loop.realtime = "prefer" uses the rights that are available')
     finding = ", ".join(lack.split(";")[0] for lack in lacking)
     remedy = "; ".join(lack.split("; ", 1)[1] for lack in lacking)
     return Check("rights", "failure" if realtime == "enforce" else "warning", f"without {finding}", remedy)
@@ -182,17 +184,17 @@ def clock(source: str | None, resolution: float) -> Check:
         reading = f"{source or 'unknown source'}, resolution {resolution * 1e3:g} ms"
         return Check("clock", "failure", reading, "boot a kernel with high-resolution timers (CONFIG_HIGH_RES_TIMERS)")
     if source is None:
-        return Check("clock", "ok", f"resolution {resolution * 1e9:g} ns; the machine does not name its source")
+        return Check("clock", "ok", f"resolution {resolution * 1e9:g} ns; the machine does not report the clock source")
     if source in RELIABLE_CLOCKS:
         return Check("clock", "ok", f"{source}, resolution {resolution * 1e9:g} ns")
-    remedy = "each reading takes microseconds: look in dmesg why the kernel left tsc; clocksource=tsc asks for it"
+    remedy = "each reading takes microseconds: see dmesg why the kernel does not use tsc; boot with clocksource=tsc"
     return Check("clock", "warning", f"{source}, resolution {resolution * 1e9:g} ns", remedy)
 
 
 def governor(governors: Mapping[int, str]) -> Check:
     """Check the frequency governors, because a processor that sleeps or slows down wakes up late."""
     if not governors:
-        return Check("governor", "ok", "no processor has frequency scaling to be seen")
+        return Check("governor", "ok", "no processor reports frequency scaling")
     others = sorted({name for name in governors.values() if name != PERFORMANCE})
     if not others:
         return Check("governor", "ok", f"{PERFORMANCE} on every processor")
@@ -207,7 +209,7 @@ def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
         return Check("processor", "ok", f"{cpu}, isolated")
     if simulated:
         return Check("processor", "ok", f"{cpu}, shared: enough for simulated drives")
-    elsewhere = f"loop.cpu = {isolated[0]} is isolated; name it" if isolated else "none is isolated"
+    elsewhere = f"set loop.cpu = {isolated[0]}, which is isolated" if isolated else "no processor is isolated"
     remedy = f"boot with isolcpus={cpu} nohz_full={cpu} and set loop.cpu = {cpu}"
     return Check("processor", "warning", f"{cpu}, shared; {elsewhere}", "" if isolated else remedy)
 
@@ -228,7 +230,9 @@ def can_interface(config: Config, machine: Machine) -> list[Check]:
         if machine.adapter:
             return [Check("CAN", "failure", f"{section.interface} needs {machine.adapter}")]
         state = f"{section.interface}, channel {section.channel or 'by default'}: its state cannot be read"
-        return [Check("CAN", "warning", state, "look at it with its maker's tools; SocketCAN tells its state")]
+        return [
+            Check("CAN", "warning", state, "check it with the manufacturer's tools; only SocketCAN reports the state")
+        ]
     if not machine.af_can:
         return [Check("CAN", "failure", "this kernel has no SocketCAN", "modprobe can_raw")]
     return [Check("CAN", "ok", "SocketCAN"), *_link(config, machine), *_traffic(config, machine.traffic)]
@@ -269,14 +273,14 @@ def _traffic(config: Config, passed: BusTraffic | None) -> list[Check]:
     )
     if share <= HIGH_LOAD:
         return [Check(name, "ok", load)]
-    return [Check(name, "warning", load, f"look who sends: candump {config.can.channel}")]
+    return [Check(name, "warning", load, f"find out which node sends: candump {config.can.channel}")]
 
 
 def _bitrate(name: str, bitrate: int, data: dict[str, Any], up: str) -> Check:
     actual = data.get("bittiming", {}).get("bitrate")
     if actual == bitrate:
         return Check(f"{name} bitrate", "ok", f"{bitrate} bit/s")
-    remedy = f"ip link set {name} down && {up}; the drives must have the same"
+    remedy = f"ip link set {name} down && {up}; the drives must have the same bitrate"
     return Check(f"{name} bitrate", "failure", f"{actual} bit/s; can.bitrate is {bitrate}", remedy)
 
 
@@ -285,7 +289,7 @@ def _state(name: str, data: dict[str, Any], up: str) -> Check:
     state = str(data.get("state", "unknown")).lower()
     errors = data.get("berr_counter", {})
     counted = f"; errors sent {errors['tx']}, received {errors['rx']}" if errors else ""
-    wiring = "look at termination (60 ohm across the bus without power), cable, and the bitrate of every node"
+    wiring = "check the termination (60 ohm across the bus without power), the cable, and the bitrate of every node"
     if state == "error-active":
         return Check(f"{name} state", "ok", f"{state}{counted}")
     if state == "bus-off":
@@ -299,7 +303,7 @@ def _queue(name: str, length: int | None, most_sent: int) -> Check:
     wanted = 2 * most_sent
     if length is None or length >= wanted:
         return Check(f"{name} queue", "ok", f"{length or 'unknown number of'} frames")
-    size = f"{length} frames; two cycles may come together and take {wanted}"
+    size = f"{length} frames; two cycles may coincide and need {wanted}"
     return Check(f"{name} queue", "warning", size, f"ip link set {name} txqueuelen 100")
 
 
@@ -314,7 +318,7 @@ def _coalescing(name: str, gathered: ReceiveCoalescing | None, up: str) -> list[
     waits = [f"{gathered.frames} frames"] if gathered.frames > 1 else []
     waits += [f"{gathered.microseconds} µs"] if gathered.microseconds else []
     if not waits:
-        return [Check(f"{name} coalescing", "ok", "each frame is handed over as it comes")]
+        return [Check(f"{name} coalescing", "ok", "each frame is delivered as it arrives")]
     # ethtool reports "off" as no time and one frame (Linux, mcp251xfd_ring_alloc).
     remedy = f"ip link set {name} down && ethtool -C {name} rx-usecs-irq 0 rx-frames-irq 1 && {up}"
-    return [Check(f"{name} coalescing", "warning", f"frames are handed over after {' or '.join(waits)}", remedy)]
+    return [Check(f"{name} coalescing", "warning", f"frames are delivered after {' or '.join(waits)}", remedy)]

@@ -59,7 +59,9 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
     """Check whether the machine can keep the configured period."""
     if isinstance(cycles, str):
         if cycles:
-            return Check("cycle", "warning", f"not measured: {cycles}", "end that service, ask again")
+            return Check(
+                "cycle", "warning", f"not measured: {cycles}", "end that service, then run trirail doctor again"
+            )
         return Check("cycle", "ok", "not measured: --quick")
     held = compute_held_rate(cycles)
     period = 1e6 / held.rate_hz
@@ -71,7 +73,7 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
     lost = f"{held.missed} of {held.cycles} ticks missed" if held.missed else ""
     remedy = "see the lines above; end other programs, or isolate a processor"
     if held.up_to_hz is None or held.up_to_hz < held.rate_hz:
-        lower = "no rate is held" if held.up_to_hz is None else f"loop.rate_hz = {held.up_to_hz} would be held"
+        lower = "no rate can be held" if held.up_to_hz is None else f"loop.rate_hz = {held.up_to_hz} can be held"
         remedy = f"{remedy}; {lower}"
     if held.missed_in_a_row > config.watchdogs.max_overruns:
         return Check(
@@ -80,7 +82,7 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
     if held.over_us.p999 > period:
         return Check("cycle", "failure", f"{summary}: the period of {period:.0f} µs is not held, {lost}", remedy)
     if held.over_us.p999 > MAX_PERIOD_SHARE * period:
-        left = f"little is left of the period of {period:.0f} µs for the service" + (f", {lost}" if lost else "")
+        left = f"little of the period of {period:.0f} µs is left for the service" + (f", {lost}" if lost else "")
         return Check("cycle", "warning", f"{summary}: {left}", remedy)
     if held.over_us.p999 > budget:
         return Check("cycle", "warning", f"{summary}: late setpoints take effect a cycle later", remedy)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 app = App(name="drives", help="Show the drives; save, compare, restore their parameters.")
 UNTESTED_NOTE = (
-    "no make of drive was tried on hardware yet: go on with trirail commission, the hand on the emergency stop"
+    "no make of drive has been tested on hardware yet: continue with trirail commission, a hand on the emergency stop"
 )
 """Note about untested drives, which is also in the first line of the example files for manufacturers' drives."""
 Axis = Literal["A", "B", "C"]
@@ -54,7 +54,9 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
     inspect = PROTOCOLS[settings.drives.protocol].inspect
     if inspect is None:
         protocol = settings.drives.protocol
-        raise DriveError(f"drives of protocol {protocol} have no objects to be shown; trirail commission finds them")
+        raise DriveError(
+            f"drives of protocol {protocol} have no objects to show: find the drives with trirail commission"
+        )
     with open_bus(settings.can, settings.drives) as bus:
         fastest = settings.limits.slider.fastest
         timing = settings.period, time.monotonic, fastest
@@ -99,9 +101,9 @@ def save(
     paths: dict[str, Path] = {name: folder / f"drive-{name}.dcf" for name in sorted(set(drive))}
     for path in paths.values():
         if path.exists():
-            raise FileError(f"{path} exists already: name another folder")
+            raise FileError(f"{path} already exists: choose another folder")
     if not folder.is_dir():
-        what = "a file, no folder; a configuration follows --config" if folder.is_file() else "no such folder"
+        what = "a file, not a folder; give a configuration with --config" if folder.is_file() else "no such folder"
         raise FileError(f"{folder}: {what}")
     ends = _read(settings, protocol, sorted(paths))
     read = {name: end for name, end in ends.items() if not isinstance(end, DriveError)}
@@ -128,7 +130,9 @@ def save(
         for why, objects in reasons.items():
             terminal.print_line(f"  {len(objects)} could not be read: {_abbreviate(objects)}: {why}")
         if getattr(settings.drives, name).eds is None:
-            terminal.print_line(f"  named by the built-in servo.eds: its maker's own objects need drives.{name}.eds")
+            terminal.print_line(
+                f"  named from the built-in servo.eds: the manufacturer's own objects need drives.{name}.eds"
+            )
     for words in failed.values():
         terminal.print_error(words)
     return 1 if failed else 0
@@ -261,7 +265,7 @@ def _load_file(file: Path, drive: Axis | None, settings: Config) -> tuple[str, S
             return name, saved
     file_node = "no node id" if saved.origin.node is None else f"node id {saved.origin.node}"
     raise DriveError(
-        f"{file} has {file_node}, the drives have {', '.join(map(str, nodes.values()))}; say which by --drive"
+        f"{file} has {file_node}, the drives have {', '.join(map(str, nodes.values()))}; select the drive with --drive"
     )
 
 
@@ -277,7 +281,7 @@ def _read(settings: Config, protocol: Protocol, names: Sequence[str]) -> dict[st
 
 def _no_dictionary_error(protocol: Protocol) -> DriveError:
     return DriveError(
-        f"drives of protocol {protocol.name} have no object dictionary to be saved: use their maker's tool"
+        f"drives of protocol {protocol.name} have no object dictionary to save: use the manufacturer's tool"
     )
 
 

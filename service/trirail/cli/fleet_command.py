@@ -98,5 +98,5 @@ def table(members: Sequence[Member], now: float) -> Table:
             terminal.plain(summary.version),
         )
     needy = sum(member.need(now) is not Attention.NOTHING for member in members)
-    drawn.caption = f"{terminal.counted(len(members), 'robot')}, {needy} need{'s' if needy == 1 else ''} somebody"
+    drawn.caption = f"{terminal.counted(len(members), 'robot')}, {needy} need{'s' if needy == 1 else ''} attention"
     return drawn

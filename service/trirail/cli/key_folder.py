@@ -60,7 +60,7 @@ class KeyFolder:
     def create(self, robot: str, addresses: Sequence[str], days: float) -> Credentials:
         """Create a new authority, and a certificate for its robot at the addresses where clients find the robot."""
         if self.folder.exists():
-            raise ServiceError(f"{self.folder} exists already: name another folder, or renew what is in it")
+            raise ServiceError(f"{self.folder} already exists: use another folder, or renew the certificates in it")
         by = authority(robot)
         with _atomic_folder(self.folder) as made:
             _write(made / AUTHORITY, by.certificate, PUBLIC)
@@ -75,11 +75,11 @@ class KeyFolder:
         """
         folder = self.folder / USERS / user
         if user in revoked(self.folder):
-            raise ServiceError(f"{user} was revoked, and the lost certificate has that name: choose another one")
+            raise ServiceError(f"{user} was revoked, and the lost certificate has this name: choose another name")
         if user == self._robot().name:
-            raise ServiceError(f"{user} is the robot itself: choose another name")
+            raise ServiceError(f"{user} is the name of the robot: choose another name")
         if folder.exists():
-            raise ServiceError(f"{folder} exists already: trirail keys renew {user} makes it good for longer")
+            raise ServiceError(f"{folder} already exists: extend the certificate with trirail keys renew {user}")
         by = self._authority()
         with _atomic_folder(folder) as made:
             _write(made / AUTHORITY, by.certificate, PUBLIC)
@@ -101,7 +101,7 @@ class KeyFolder:
         """Revoke a user's role and delete the user's folder."""
         there = self._find(user)
         if there.is_robot:
-            raise ServiceError(f"{user} is the robot itself: a new authority makes its certificate worthless")
+            raise ServiceError(f"{user} is the robot itself, and cannot be revoked: create a new authority instead")
         names = sorted({*revoked(self.folder), user})
         _write(self.folder / REVOKED, "".join(f"{name}\n" for name in names).encode(), PUBLIC)
         with _as_service_error():
@@ -135,7 +135,7 @@ def _issued(folder: Path, *, is_robot: bool) -> IssuedCertificate:
     try:
         certificate = x509.load_pem_x509_certificate(_read(file))
     except ValueError as error:
-        raise ServiceError(f"{file}: not a certificate as PEM") from error
+        raise ServiceError(f"{file}: not a certificate in PEM format") from error
     return IssuedCertificate(
         common_name(certificate), is_robot, serves(certificate), certificate.not_valid_after_utc, folder
     )
@@ -176,4 +176,4 @@ def _as_service_error() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ServiceError(f"{error.filename}: {error.strerror}; trirail keys init makes an authority") from error
+        raise ServiceError(f"{error.filename}: {error.strerror}; create an authority with trirail keys init") from error

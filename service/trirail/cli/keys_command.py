@@ -40,7 +40,7 @@ def _check_hosts(addresses: tuple[str, ...]) -> None:
     for address in addresses:
         if not is_host(address):
             raise ValueError(
-                f"{quoted(address)!r} is no host name or IP address, as 192.0.2.7, without protocol and port"
+                f"{quoted(address)!r} is not a host name or IP address such as 192.0.2.7, without protocol and port"
             )
 
 
@@ -80,7 +80,7 @@ def init(
         terminal.json({"folder": str(folder), "robot": robot, "addresses": addresses, "expires": made.expires})
         return 0
     terminal.print_line(f"{folder}: an authority, and the certificate of {robot} at {', '.join(addresses)}")
-    terminal.print_line(f"good until {made.expires:%Y-%m-%d}; keep ca-key.pem where only you can read it")
+    terminal.print_line(f"valid until {made.expires:%Y-%m-%d}; keep ca-key.pem where only you can read it")
     terminal.print_line("in the robot's configuration:")
     for line in ("[zenoh]", 'listen = ["tls/0.0.0.0:7447"]', "[zenoh.tls]", f'directory = "{folder}"'):
         terminal.print_line(f"    {line}")
@@ -115,9 +115,9 @@ def add(
     if json:
         terminal.json({"user": user, "role": role, "folder": str(made.folder), "expires": made.expires})
         return 0
-    terminal.print_line(f"{made.folder}: {user}'s certificate, good until {made.expires:%Y-%m-%d}")
-    terminal.print_line("give it to nobody else; on the user's machine it belongs in ~/.config/trirail/<robot>/")
-    terminal.print_line("in the robot's configuration, then start the service again while the robot stands:")
+    terminal.print_line(f"{made.folder}: {user}'s certificate, valid until {made.expires:%Y-%m-%d}")
+    terminal.print_line("give it only to this user; on the user's machine, it belongs in ~/.config/trirail/<robot>/")
+    terminal.print_line("in the robot's configuration, then restart the service while the robot is at rest:")
     for line in ("[zenoh.users]", f'{user} = "{role}"'):
         terminal.print_line(f"    {line}")
     return 0
@@ -154,7 +154,7 @@ def further(
         return 0
     until = f"{made.expires:%Y-%m-%d}"
     terminal.print_line(f"{made.folder}: the certificate of {name} at {', '.join(addresses)}, until {until}")
-    terminal.print_line("give it to that robot's machine alone, and name it there: [zenoh.tls] directory")
+    terminal.print_line("copy it only to that robot's machine, and set it there as [zenoh.tls] directory")
     return 0
 
 
@@ -205,8 +205,8 @@ def renew(name: str, /, *, days: Days = 365.0, folder: AuthorityFolder = HERE, j
     if json:
         terminal.json({"name": name, "folder": str(made.folder), "expires": made.expires})
         return 0
-    then = "start the service again while the robot stands" if made.is_robot else "give its cert.pem to the user"
-    terminal.print_line(f"{made.folder}: good until {made.expires:%Y-%m-%d}; {then}")
+    then = "restart the service while the robot is at rest" if made.is_robot else "give its cert.pem to the user"
+    terminal.print_line(f"{made.folder}: valid until {made.expires:%Y-%m-%d}; {then}")
     return 0
 
 
@@ -229,8 +229,8 @@ def revoke(user: str, /, *, folder: Folder = HERE, json: Json = False) -> int:
     if json:
         terminal.json({"user": user, "revoked": True})
         return 0
-    terminal.print_line(f"{user} has no role any more wherever this {folder / 'revoked.txt'} is read")
+    terminal.print_line(f"{user} no longer has a role wherever this {folder / 'revoked.txt'} is read")
     terminal.print_line(
-        "copy it to the folder of [zenoh.tls] of every robot and router of this authority, and start them again"
+        "copy it to the folder of [zenoh.tls] of every robot and router of this authority, and restart their services"
     )
     return 0

@@ -65,7 +65,7 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
             with Live(console=out, refresh_per_second=10, transient=False) as live:
                 for state in robot.states(SERVICE_TIMEOUT_S):
                     live.update(table(state, robot.name, info.labels, limits))
-        raise ServiceError("the service has gone silent")
+        raise ServiceError("the service no longer sends its state")
 
 
 def _print_once_a_second(robot: Robot) -> None:
@@ -89,7 +89,7 @@ def show_jog(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True
                 live.update(table(state, robot.name, labels))
             if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
                 return
-    raise ServiceError("the service has gone silent")
+    raise ServiceError("the service no longer sends its state")
 
 
 def limits_of(info: Info) -> Limits:
@@ -99,7 +99,7 @@ def limits_of(info: Info) -> Limits:
     try:
         return converted(info.limits, Limits)
     except msgspec.ValidationError as error:
-        raise ServiceError(f"the service is of another version: its limits cannot be read: {error}") from error
+        raise ServiceError(f"the service has another version, and its limits cannot be read: {error}") from error
 
 
 def table(state: State, robot: str, labels: Labels, limits: Limits | None = None) -> Table:

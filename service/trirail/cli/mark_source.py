@@ -75,7 +75,9 @@ def program(command: str) -> Iterator[Source]:
         )
         stdin, stdout = cast(IO[str], process.stdin), cast(IO[str], process.stdout)
     except (OSError, ValueError) as error:
-        raise TrirailError(f"cannot run {command!r}: {error}; it is to print one line of JSON for each look") from error
+        raise TrirailError(
+            f"cannot run {command!r}: {error}; the program must print one line of JSON for each look"
+        ) from error
 
     def find_marks() -> Marks:
         with contextlib.suppress(BrokenPipeError):  # it has exited; its last line may still be in the pipe
@@ -83,12 +85,14 @@ def program(command: str) -> Iterator[Source]:
             stdin.flush()
         if not select.select([stdout], [], [], PICTURE_TIMEOUT_S)[0]:
             raise TrirailError(
-                f"{command!r} has printed no line in {PICTURE_TIMEOUT_S:g} s: does it flush what it prints?"
+                f"{command!r} has printed no line in {PICTURE_TIMEOUT_S:g} s; check that it flushes its output"
             )
         line = stdout.readline()
         if not line:
             code = process.wait(EXIT_TIMEOUT_S)
-            raise TrirailError(f"{command!r} has ended with exit code {code}: it is to print a line for each it reads")
+            raise TrirailError(
+                f"{command!r} has ended with exit code {code}: it must print one line for each line that it reads"
+            )
         try:
             marks: Marks = decoded(line, LINE)
         except (msgspec.MsgspecError, ValueError) as error:
@@ -126,7 +130,7 @@ def folder(
     """
     cv2 = _opencv()
     if not path.is_dir():
-        raise TrirailError(f"{path}: not a folder; expected one with a picture of each mark, such as left.png")
+        raise TrirailError(f"{path}: not a folder; expected a folder with a picture of each mark, such as left.png")
 
     used: set[Path] = set()
 
@@ -136,12 +140,15 @@ def folder(
         while any(_written(each) <= at for each, at in asked.items()):
             if time.monotonic() > deadline:
                 raise TrirailError(
-                    f"{path}: no newer pictures within {PICTURE_TIMEOUT_S:g} s: does what takes them run?"
+                    f"{path}: no newer pictures within {PICTURE_TIMEOUT_S:g} s; check that the program that takes them "
+                    "runs"
                 )
             time.sleep(POLL_S)
         pictures = {each.stem: each for each in sorted(path.glob("[!.]*")) if each.suffix.lower() in PICTURES}
         if not pictures:
-            raise TrirailError(f"{path}: no picture in it; expected one of each mark, such as left.png")
+            raise TrirailError(
+                f"{path}: the folder has no picture; expected one picture of each mark, such as left.png"
+            )
         wanted = windows or {name: MarkWindow(name) for name in pictures}
         marks: dict[str, tuple[float, float]] = {}
         codes = None if family is None else Codes(family)
@@ -153,7 +160,9 @@ def folder(
             whole_by = time.monotonic() + WRITE_TIMEOUT_S
             while (grey := cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) is None:
                 if time.monotonic() > whole_by:
-                    raise TrirailError(f"{file}: no picture that OpenCV reads; write it as .{file.name} and rename it")
+                    raise TrirailError(
+                        f"{file}: OpenCV cannot read this picture; write it as .{file.name}, then rename it"
+                    )
                 time.sleep(POLL_S)
             used.add(file)
             if codes is not None:
@@ -207,7 +216,7 @@ def cameras(
     shown = Counter(devices.values())
     for name, device in devices.items():
         if shown[device] > 1 and name not in windows:
-            raise TrirailError(f"camera {device} shows several marks: give each a --window, as {name}=0,0,640,960")
+            raise TrirailError(f"camera {device} shows several marks: give each a --window, such as {name}=0,0,640,960")
     if unknown := ", ".join(set(windows) - set(devices)):
         raise TrirailError(f"--window of {unknown}: no --camera shows that mark")
     with contextlib.ExitStack() as opened:
@@ -217,7 +226,9 @@ def cameras(
             opened.callback(capture.release)
             if not capture.isOpened():
                 names = ", ".join(name for name in devices if devices[name] == device)
-                raise TrirailError(f"cannot open camera {device} of {names}: is it plugged in, and may you read it?")
+                raise TrirailError(
+                    f"cannot open camera {device} of {names}; check that it is plugged in, and that you may read it"
+                )
             captures[device] = capture
 
         def find_marks() -> Marks:
@@ -226,7 +237,7 @@ def cameras(
             for device, capture in captures.items():
                 frame = newest(capture, cv2.CAP_PROP_FRAME_COUNT)
                 if frame is None:
-                    raise TrirailError(f"camera {device} gives no picture any more")
+                    raise TrirailError(f"camera {device} no longer delivers pictures")
                 grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
                 for name, its in devices.items():
                     if its == device and codes is not None:
@@ -273,7 +284,7 @@ def _marks(name: str, grey: Any, window: MarkWindow, shape: MarkShape, turn: flo
 
     rows, columns = grey.shape
     if window.width and (window.u + window.width > columns or window.v + window.height > rows):
-        raise TrirailError(f"the window of {name} is beyond its picture of {columns} × {rows} pixels")
+        raise TrirailError(f"the window of {name} extends beyond its picture of {columns} × {rows} pixels")
     bottom, right = (window.v + window.height, window.u + window.width) if window.width else (rows, columns)
     mark = find(grey[window.v : bottom, window.u : right], shape, turn)
     return {} if mark is None else {name: (mark.u + window.u, mark.v + window.v)}
@@ -283,7 +294,7 @@ def _opencv() -> Any:
     try:
         return importlib.import_module("cv2")
     except ImportError as error:
-        raise TrirailError(f"pictures are read by OpenCV, which is not installed: {INSTALL}") from error
+        raise TrirailError(f"reading pictures needs OpenCV, which is not installed: {INSTALL}") from error
 
 
 @Parameter(name="*")
@@ -322,13 +333,13 @@ class MarkSource:
 
         selected = [self.program is not None, self.pictures is not None, bool(self.camera)]
         if sum(selected) != 1:
-            raise TrirailError("marks are from one of --program, --pictures and --camera; give one of them")
+            raise TrirailError("marks have one source: give exactly one of --program, --pictures and --camera")
         shape, turn = MarkShape(self.shape, self.size), math.radians(self.turn)
         family = self.family if self.shape == "code" else None
         if family is not None and self.window:
-            raise TrirailError("--window is not for codes: each is known by its number")
+            raise TrirailError("--window cannot be used with codes, which are identified by their numbers")
         if self.window and self.program is not None:
-            raise TrirailError("--window is for pictures: a program tells where its marks are")
+            raise TrirailError("--window is only for pictures: a program reports the positions of its marks itself")
         windows = dict(map(_window, self.window))
         with contextlib.ExitStack() as stack:
             if self.program is not None:

@@ -105,8 +105,8 @@ def share(text: str) -> float:
         value = math.nan
     if not LOWEST_SHARE <= value <= 1.0:
         raise ValueError(
-            f"{quoted(text.strip())!r} is no share of the limits: {LOWEST_SHARE} to 1, or {LOWEST_SHARE:.1%} to 100%"
-            + comma_hint(text)
+            f"{quoted(text.strip())!r} is not a share of the limits: use {LOWEST_SHARE} to 1, or {LOWEST_SHARE:.1%} to "
+            "100%" + comma_hint(text)
         )
     return value
 
@@ -118,7 +118,7 @@ def percent(text: str) -> float:
         converted({"percent": value}, Override)
     except (ValueError, msgspec.ValidationError):
         raise ValueError(
-            f"{quoted(text.strip())!r} is no override: 0, or {LOWEST_OVERRIDE:g} to 200 %{comma_hint(text)}"
+            f"{quoted(text.strip())!r} is not an override: use 0, or {LOWEST_OVERRIDE:g} to 200 %{comma_hint(text)}"
         ) from None
     return value
 
@@ -127,9 +127,7 @@ def positive(text: str, dimension: Dimension) -> float:
     """Parse a quantity that must not be negative. Raises ValueError with examples of allowed values."""
     value = quantity(text, dimension)
     if value < 0.0:
-        raise ValueError(
-            f"{quoted(text.strip())!r} is negative: {dimension.name} such as {dimension.examples} is taken"
-        )
+        raise ValueError(f"{quoted(text.strip())!r} is negative: use {dimension.name} such as {dimension.examples}")
     return value
 
 
@@ -166,9 +164,11 @@ def _tool(text: str) -> tuple[float, float] | str:
     if comma:
         return quantity(u, LENGTH), quantity(v, LENGTH)
     if is_length(text) and not is_name(text):
-        raise ValueError(f"{quoted(text.strip())!r} is half a point: U V, as 20mm 0, or a name of [frames.tool]")
+        raise ValueError(
+            f"{quoted(text.strip())!r} is only half a point: give U V, such as 20mm 0, or a name of [frames.tool]"
+        )
     if not is_name(text):
-        raise ValueError(f"{quoted(text.strip())!r} is neither a point, as 20mm 0, nor a name: {NAME_RULE}")
+        raise ValueError(f"{quoted(text.strip())!r} is neither a point, such as 20mm 0, nor a name: {NAME_RULE}")
     return text
 
 

@@ -81,7 +81,7 @@ def wait_for_robot(service: Service) -> None:
                 return
         except ServiceError as error:
             if not is_announced:
-                terminal.print_error(f"{error}; waiting for it, Ctrl-C ends")
+                terminal.print_error(f"{error}; waiting for the service, Ctrl-C ends")
                 is_announced = True
             time.sleep(RETRY_S)
 
@@ -103,7 +103,7 @@ def read_token(file: Path) -> str:
     except OSError as error:
         raise ConfigError(f"{file}: {error.strerror}") from error
     if mode & 0o077:
-        raise ConfigError(f"{file}: others may read this token (mode {mode:03o}): chmod 600 {file}")
+        raise ConfigError(f"{file}: other users can read this token (mode {mode:03o}): run chmod 600 {file}")
     if not TOKEN.fullmatch(text):
         raise ConfigError(
             f"{file}: not a valid token: expected 16 to 128 letters, digits, - or _; "

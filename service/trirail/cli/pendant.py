@@ -167,7 +167,9 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
     terminal or the service does not answer.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
+        raise ServiceError(
+            "jogging with keys needs a terminal; without a terminal, use trirail jog VX VY W --seconds S"
+        )
     top = converted(robot.info().limits, Limits).platform.velocity
     pendant = Pendant(robot, top, tool)
     with _StateReader(robot) as newest:

@@ -148,7 +148,7 @@ def link(name: str) -> dict[str, Any] | None:
         result = subprocess.run(command, capture_output=True, check=True)
     except FileNotFoundError as error:
         raise ServiceError(
-            "the program ip, which tells a CAN interface's state, is missing: install iproute2"
+            "the program ip, which reports a CAN interface's state, is missing: install iproute2"
         ) from error
     except subprocess.CalledProcessError as error:
         raise ServiceError(f"{' '.join(command)}: {error.stderr.decode(errors='replace').strip()}") from error

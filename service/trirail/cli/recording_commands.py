@@ -50,7 +50,9 @@ def replay(
     recording = _read(file)
     settings = load(config) if config else provenance.configuration(recording.texts)
     if settings is None:
-        raise ServiceError(f"{file[0]}: its configuration is not in it: was it made by an older version? Use --config")
+        raise ServiceError(
+            f"{file[0]}: the recording does not contain its configuration, as in older versions: give it with --config"
+        )
     by, here = provenance.recorded_by(recording.texts), provenance.software()
     compared = replay_session(recording, settings, simulated=config is not None)
     if json:
@@ -139,9 +141,9 @@ def export(
         raise TrirailError(f"{path}: the name of a file of format {format} must end in .{format}")
     wanted = [column.strip() for column in columns.split(",") if column.strip()]
     if path.suffix == ".mcap" and wanted:
-        raise TrirailError("--columns selects columns of a table: MCAP has messages with all of them")
+        raise TrirailError("--columns is only for tables: MCAP messages contain all columns")
     if switches and (every is not None or wanted or path.suffix == ".mcap"):
-        raise ServiceError("--switches writes a table with a row per switch: leave --every, --columns and MCAP out")
+        raise ServiceError("--switches writes a table with one row per switch: omit --every, --columns and MCAP")
     recording = _read(file).part(begin, end, goal=goal, every=every)
     if path.suffix == ".mcap":
         unit, count = "messages", _write_mcap(recording, path)
@@ -175,7 +177,7 @@ def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json =
             with out.open("x", encoding="utf-8") as file:
                 file.write(text)
         except FileExistsError as error:
-            raise ServiceError(f"{out} exists already: name another file") from error
+            raise ServiceError(f"{out} already exists: choose another file") from error
         except OSError as error:
             raise ServiceError(f"cannot write {out}: {error.strerror or error}") from error
     if json:
@@ -228,7 +230,7 @@ def _print_comparison(
     lines.add("replayed", f"{compared.cycles} cycles, {compared.requests} requests, on {drives}")
     lines.add("recorded by", terminal.plain(str(by)) if by else "[yellow]unknown software[/]")
     if by != here:
-        lines.add("[yellow]replayed by[/]", f"{terminal.plain(str(here))}: other software may plan otherwise")
+        lines.add("[yellow]replayed by[/]", f"{terminal.plain(str(here))}: other software may plan differently")
     if compared.lacking:
         lines.add("[yellow]not replayed[/]", f"{compared.lacking} cycles: what came before them is not recorded")
     if compared.plans:

@@ -133,8 +133,8 @@ class RemoteRobot:
                 return item
             before.append(item)
         raise ServiceError(
-            f"robot {info.robot!r} answers, but no records come from it within {FIRST_RECORDS_TIMEOUT_S:g} s: "
-            "may this user read them, and does every router on the way pass them on?"
+            f"robot {info.robot!r} answers, but sends no records within {FIRST_RECORDS_TIMEOUT_S:g} s: "
+            "check that this user may read them, and that every router on the way forwards them"
         )
 
     def _run(self) -> None:

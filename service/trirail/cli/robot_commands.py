@@ -80,11 +80,15 @@ def goto(
     if y is None or phi is None:
         if y is not None:
             typed = f"X = {x} and Y = {notation.written(y, 'mm', 3)}"
-            raise CycloptsError(msg=f"goto takes X, Y and PHI: here are {typed}, and PHI is missing, the angle, as 0")
+            raise CycloptsError(
+                msg=f"goto takes X, Y and PHI, but only {typed} are given: add the angle PHI, such as 0"
+            )
         if notation.is_length(x):
-            raise CycloptsError(msg=f"goto takes X, Y and PHI, or the NAME of a pose: here is X = {x.strip()} alone")
+            raise CycloptsError(
+                msg=f"goto takes X, Y and PHI, or the NAME of a pose, but only X = {x.strip()} is given"
+            )
         if tool is not None or frame != "base":
-            raise CycloptsError(msg="the pose of a NAME is where it was taught: it knows no --tool and no --frame")
+            raise CycloptsError(msg="the pose of a NAME is fixed: it cannot be combined with --tool or --frame")
         check_name(x, "pose")
         with service.open() as robot:
             return _follow(service, robot, robot.move_to_named(x, speed=speed, blend=blend), wait, x)
@@ -295,10 +299,10 @@ def poses(*, service: Service = HERE) -> int:
     width = max(map(len, named_poses), default=0)
     for name, pose in named_poses.items():
         whose = "taught" if pose.taught else "of [poses]"
-        whose += ", with another geometry: look at it, and teach it again" if pose.other_geometry else ""
+        whose += ", with another geometry: check it, and teach it again" if pose.other_geometry else ""
         terminal.print_line(f"{name:<{width}}   {notation.pose((pose.x, pose.y, pose.phi), 9)}   {whose}")
     if not named_poses:
-        terminal.print_line("there is none: trirail teach NAME makes one of where the robot stands")
+        terminal.print_line("there are no saved poses: trirail teach NAME saves the present pose of the robot")
     return 0
 
 
@@ -347,8 +351,8 @@ def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.
         Time without a sign of life from this command after which the lease ends with a controlled stop: 0.1 to 10 s.
     """
     if not SHORTEST_LEASE <= timeout <= LONGEST_LEASE:
-        allowed = f"{SHORTEST_LEASE:g} to {LONGEST_LEASE:g} s would be right"
-        raise CycloptsError(msg=f"Invalid value for --timeout: {timeout:g} s is none: {allowed}")
+        allowed = f"use {SHORTEST_LEASE:g} to {LONGEST_LEASE:g} s"
+        raise CycloptsError(msg=f"Invalid value for --timeout: {timeout:g} s: {allowed}")
     with (
         service.open() as robot,
         robot.lease(force=force, timeout=timeout) as lease,

@@ -83,14 +83,15 @@ def settings(config: RouterConfig) -> dict[str, Any]:
     folder = Path(config.zenoh.tls.directory)
     if gone := sorted(revoked(folder) & config.behind.keys()):
         raise ServiceError(
-            f"{', '.join(gone)}: revoked, but in robots or routers, so that the lost certificate would be accepted; "
-            "remove the name there, and give a robot or router that is still in use a certificate of another name"
+            f"{', '.join(gone)}: revoked, but listed in robots or routers, so the lost certificate would be accepted: "
+            "remove the name from the list, and give a robot or router that is still in use a certificate of another "
+            "name"
         )
     own = Credentials.read_server(folder)
     if own.name in (*config.behind, *config.all_robots):
         raise ServiceError(
-            f"{folder}: the certificate of {own.name}, which is behind this router: a router has a name of its own, "
-            "by trirail keys init --robot or trirail keys robot"
+            f"{folder}: this is the certificate of {own.name}, which is behind this router; the router needs its own: "
+            "create one with trirail keys init --robot or trirail keys robot"
         )
     rules = router_access_control(config.behind, with_role(config.zenoh.users, folder), config.zenoh.router)
     return zenoh_session.router(listen, own, rules, connect, thinned)

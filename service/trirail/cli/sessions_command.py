@@ -33,7 +33,7 @@ def _moment(_: Any, tokens: Sequence[Token]) -> datetime:
         return datetime.fromisoformat(tokens[0].value)
     except ValueError as error:
         raise ValueError(
-            f"{quoted(tokens[0].value)!r} is no day or time such as 2026-01-31 or 2026-01-31T12:00:00"
+            f"{quoted(tokens[0].value)!r} is not a day or time such as 2026-01-31 or 2026-01-31T12:00:00"
         ) from error
 
 
@@ -85,7 +85,7 @@ def sessions(
     from trirail.telemetry.sessions import SessionFilter, fault_codes, find, recorded
 
     if not folder.is_dir():
-        raise ServiceError(f"{folder}: no such folder: name that of [telemetry] directory")
+        raise ServiceError(f"{folder}: no such folder: use the folder of [telemetry] directory")
     wanted = SessionFilter(
         robot, since.timestamp() if since else None, until.timestamp() if until else None, fault, user, outcome
     )
@@ -98,14 +98,14 @@ def sessions(
         return 0
     _print(shown, len(matches))
     if known:
-        terminal.print_line(f"no recorded fault says {quoted(fault or '')}: there are {', '.join(known)}")
+        terminal.print_line(f"no recorded fault contains {quoted(fault or '')}; known faults: {', '.join(known)}")
     return 0
 
 
 def _check_code(words: str | None) -> None:
     """Refuse text that begins like a code but cannot be one. Codes have 16 bits or, on an ODrive, 32."""
     if words and words[:2].lower() == "0x" and re.fullmatch(r"[0-9a-fA-F]{0,8}", words[2:]) is None:
-        raise ValueError(f"{quoted(words)!r} is no code such as 0x8700")
+        raise ValueError(f"{quoted(words)!r} is not a code such as 0x8700")
 
 
 REPORT_INTERVAL_S = 1.0

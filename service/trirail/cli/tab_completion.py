@@ -24,7 +24,7 @@ def script(app: App, shell: Shell | None, *, install: bool) -> int:
         else:
             sys.stdout.write(app.generate_completion(shell=shell))
     except ShellDetectionError as error:
-        raise TrirailError("shell not recognised: name bash, zsh or fish") from error
+        raise TrirailError("shell not recognised: use bash, zsh or fish") from error
     except OSError as error:
         raise TrirailError(f"cannot install: {error}") from error
     return 0

@@ -125,16 +125,16 @@ MIN_SLOWDOWN = 1.001
 
 def slowed(reply: GoalReply) -> str:
     """Return the slowdown of an accepted goal in words, or "" if it is not slowed down."""
-    return f"slowed {reply.slowed:.4g} times: it would be beyond the limits" if reply.slowed > MIN_SLOWDOWN else ""
+    return f"slowed {reply.slowed:.4g} times, to keep within the limits" if reply.slowed > MIN_SLOWDOWN else ""
 
 
 def notes(reply: GoalReply) -> str:
     """Return remarks on an accepted goal in parentheses, or "" if it is executed as requested."""
     remarks = [words] if (words := slowed(reply)) else []
     if reply.stops_first:
-        remarks.append("stops on the old path first")
+        remarks.append("stops on its present path first")
     if reply.queued:
-        remarks.append("waits for the goal before it")
+        remarks.append("waits for the previous goal")
     return f" ({', '.join(remarks)})" if remarks else ""
 
 
@@ -167,7 +167,7 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
                     progress.update(task, completed=state.goal.progress, left=left(state, state.goal))
             if goal.result is not None:
                 return goal.result
-            raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
+            raise ServiceError(f"the service no longer sends its state: the end of goal {goal.id} is unknown")
 
         try:
             return wait_for_end()

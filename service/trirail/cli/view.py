@@ -49,8 +49,8 @@ def run(
         raise ServiceError(f"{file} is not a file; recordings are .rrd files in the service's telemetry.directory")
     if not web and not has_display():
         raise ServiceError(
-            "no display for the viewer: DISPLAY and WAYLAND_DISPLAY are not set; trirail view --web shows it in a "
-            "browser, and from a machine with a display trirail view --connect tcp/<this machine>:7447 shows it there"
+            "no display for the viewer: DISPLAY and WAYLAND_DISPLAY are not set; use trirail view --web, which "
+            "needs a browser, or, on a machine with a display, trirail view --connect tcp/<this machine>:7447"
         )
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with _source(file, robots, connect, tls, records) as source, contextlib.suppress(KeyboardInterrupt):
@@ -91,7 +91,7 @@ def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | 
     if not info.live:
         raise ServiceError(
             "the service has no live view (telemetry.live_port = 0): "
-            "trirail view --records draws one here from the published records"
+            "use trirail view --records, which draws the view here from the published records"
         )
     parts = urlsplit(info.live)
     try:
@@ -99,7 +99,7 @@ def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | 
     except OSError as error:
         raise ServiceError(
             f"nothing answers at {info.live} on this machine: "
-            "if the service runs on another, use trirail view --records"
+            "if the service runs on another machine, use trirail view --records"
         ) from error
     yield info.live
 
@@ -138,7 +138,9 @@ def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
             last = log.read().decode(errors="replace").strip().rpartition("\n")[2]
             # If the viewer cannot open its window, it prints a message but still exits with 0.
             if viewer.poll() or (viewer.poll() == 0 and last.startswith("Error: ")):
-                raise ServiceError(f"the viewer failed: {last}; trirail view --web needs no graphics driver here")
+                raise ServiceError(
+                    f"the viewer failed: {last}; use trirail view --web, which needs no graphics driver here"
+                )
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(viewer.pid, signal.SIGTERM)  # `python -m rerun_cli` does not forward signals

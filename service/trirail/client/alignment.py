@@ -193,7 +193,9 @@ def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:
 def check(result: Result) -> None:
     """Raise RefusedError if a motion has not reached its target."""
     if result.outcome not in ENDS_AT_TARGET:
-        raise RefusedError(RefusalCode.FAILED, f"a motion of the alignment ended {result.outcome}: {result.message}")
+        raise RefusedError(
+            RefusalCode.FAILED, f"a motion of the alignment ended with the outcome {result.outcome}: {result.message}"
+        )
 
 
 def _sum(a: Triple, b: Triple) -> Triple:

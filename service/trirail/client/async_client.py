@@ -641,7 +641,7 @@ class AsyncRobot:
     @property
     def _connection(self) -> AsyncConnection:
         if self._open is None:
-            raise ServiceError("not connected: use it within `async with AsyncRobot(…) as robot`")
+            raise ServiceError("not connected: use the robot within `async with AsyncRobot(…) as robot`")
         return self._open
 
     def _on_event(self, event: Event) -> None:

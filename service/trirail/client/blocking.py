@@ -79,7 +79,7 @@ class LoopThread:
             if self._closed:
                 problem = CLOSED
             elif threading.current_thread() is self._thread:
-                problem = "a robot was called by a function that it had called itself"
+                problem = "a function that the robot calls must not call the robot: call it from another thread"
             else:
                 return asyncio.run_coroutine_threadsafe(coroutine, self._loop)
         coroutine.close()

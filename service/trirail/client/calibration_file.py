@@ -69,13 +69,13 @@ def keep_old(path: Path) -> Path | None:
     try:
         return Path(shutil.copy2(path, old))
     except OSError as error:
-        raise FileError(f"cannot keep {path} as {old}: {error.strerror}") from error
+        raise FileError(f"cannot copy {path} to {old}: {error.strerror}") from error
 
 
 def read(path: Path) -> CalibrationFile:
     """Read a calibration file. Raises FileError that names the file, the field and the expected value."""
     if not path.exists():
-        raise FileError(f"{path}: no such file; trirail align calibrate makes it")
+        raise FileError(f"{path}: no such file; create it with trirail align calibrate")
     text = files.text(path)
     try:
         return decoded(text, CalibrationFile)

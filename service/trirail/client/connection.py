@@ -107,15 +107,15 @@ class Connection:
         """
         if reply.ok is not None:
             try:
-                answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
+                answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "its answer cannot be read")
             except RefusedError as error:
-                return ServiceError(f"somebody answered at {self._connect}, but {error}")
+                return ServiceError(f"a program answered at {self._connect}, but {error}")
             return self._note_sequence(answer)
         content = reply.err.payload.to_bytes() if reply.err is not None else b""
         if content == ZENOHS_TIMEOUT:
             return ServiceError(
-                f"robot {self.robot!r} at {self._connect} has not answered in time: its service, or the network to it, "
-                "is overloaded or hangs; its log tells more"
+                f"robot {self.robot!r} at {self._connect} has not answered in time: its service or the network "
+                "is overloaded or hangs; see the log of the service"
             )
         refused = refusal(content)
         if isinstance(refused, RefusedError):
@@ -157,7 +157,7 @@ class Connection:
                 answers.append(error)
 
         def on_end() -> None:
-            silent = SilenceError(self._no_answer_message("is its service running?"))
+            silent = SilenceError(self._no_answer_message("check that its service is running"))
             deliver(answers[0] if answers else silent)
 
         handler = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
@@ -180,23 +180,26 @@ class Connection:
         """
         return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
             self._no_answer_message(
-                "is its service up, is the name right (--robot), is it linked to the router if this is one?"
+                "check that its service is running, the name is right (--robot), and a router, if any, has a link to it"
             )
         )
 
     def _no_answer_message(self, why: str) -> str:
         """Return the error message for a query without a reply; `why` is the supposed reason."""
         if is_starting(self._connect):
-            why = "the service there is starting; try again when it says that it is up"
+            why = "the service is starting; try again when it reports that it is up"
         return f"no robot {self.robot!r} answers at {self._connect}: {why}"
 
     def _denied(self, parts: tuple[str, ...], user: str, role: str | None) -> RefusedError | None:
         """Return the error to raise if the user's role does not allow the key made of `parts`; None if it does."""
         needed = least_role(*parts)
         if role is None:
-            problem = f"{user} has no role at {self.robot}: [zenoh.users] does not list this user, or it is revoked"
+            problem = (
+                f"{user} has no role at robot {self.robot}: [zenoh.users] does not list the user, or the user is "
+                "revoked"
+            )
         elif not Role(role).includes(needed):
-            problem = f"{user} is {role} at {self.robot}: {'/'.join(parts)} needs {needed}"
+            problem = f"{user} is {role} at robot {self.robot}: {'/'.join(parts)} needs the role {needed}"
         else:
             return None
         return RefusedError(RefusalCode.NOT_ALLOWED, problem)
@@ -293,5 +296,5 @@ def refusal(payload: bytes) -> RefusedError | ServiceError:
     try:
         error: ErrorReply = boundary.decode(payload, ErrorReply, "not an error reply")
     except RefusedError:
-        return ServiceError(f"no answer from the service: {quoted(payload.decode(errors='replace'))}")
+        return ServiceError(f"no valid answer from the service: {quoted(payload.decode(errors='replace'))}")
     return RefusedError(error.code, error.message, slider=error.slider, value=error.value, limit=error.limit)

@@ -31,7 +31,7 @@ def identity(
     name = check_name(user or known_as or _user(), "user")
     if credentials is not None and known_as != name:
         whose = f"in the name of {quoted(known_as)}" if known_as else "without a common name"
-        problem = f"the certificate in {credentials.folder} is {whose}: {name} cannot send with it"
+        problem = f"the certificate in {credentials.folder} is {whose}: it cannot be used to send as {name}"
         raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
     return robot, connect, name, credentials
 

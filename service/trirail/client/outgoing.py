@@ -81,7 +81,7 @@ def too_many(number: int) -> str:
         return ""
     step = -(-number // MAX_POINTS)
     return (
-        f"{number} points, a trajectory has {MAX_POINTS} at most: take every {step}th and the last, since paths are "
+        f"{number} points exceed the maximum of {MAX_POINTS}: send every {step}th point and the last, since paths are "
         "quintic between points, or send parts that each end at rest"
     )
 
@@ -124,7 +124,9 @@ def seconds(value: object) -> float | None:
         return None
     wait = number(value, "timeout")
     if wait < 0.0:
-        raise RefusedError(RefusalCode.MALFORMED, f"timeout is {wait:g} s: expected 0 or more, or None for no end")
+        raise RefusedError(
+            RefusalCode.MALFORMED, f"timeout is {wait:g} s: expected 0 or more, or None to wait without limit"
+        )
     return wait if wait < threading.TIMEOUT_MAX else None
 
 

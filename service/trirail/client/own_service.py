@@ -143,4 +143,4 @@ def _wait(process: Process, ready: socket.socket, report_start: Callable[[str], 
             report_start(notification.partition("STATUS=")[2].partition("\n")[0])
         if process.poll() is not None:
             raise ServiceError("the service could not start, see above")
-    raise ServiceError(f"the service was not up within {START_WITHIN:g} s")
+    raise ServiceError(f"the service did not start within {START_WITHIN:g} s")

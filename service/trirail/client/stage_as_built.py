@@ -81,13 +81,15 @@ class StageAsBuilt:
         """
         with self._changed:
             if not self._changed.wait_for(lambda: self._cycles and self._cycles[-1][0] >= time, COMES_WITHIN):
-                raise ServiceError(f"no records of time {time:.3f} s within {COMES_WITHIN:g} s: does the service run?")
+                raise ServiceError(
+                    f"no records of time {time:.3f} s within {COMES_WITHIN:g} s; check that the service is running"
+                )
             after = len(self._cycles) - 1
             while after > 0 and self._cycles[after - 1][0] >= time:
                 after -= 1
             (begin, first), (end, last) = self._cycles[max(0, after - 1)], self._cycles[after]
         if time < begin:
-            raise ServiceError(f"time {time:.3f} s is before the records that are kept: they begin at {begin:.3f} s")
+            raise ServiceError(f"time {time:.3f} s is before the first record that is kept, at {begin:.3f} s")
         share = (time - begin) / (end - begin) if end > begin else 1.0
         a, b, c = (p + share * (q - p) for p, q in zip(first, last, strict=True))
         return a, b, c

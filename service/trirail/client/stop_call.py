@@ -130,7 +130,7 @@ class StopCall:
         except TrirailError as error:
             self._deliver(error)
         except Exception as error:  # noqa: BLE001 - the caller must get an outcome in any case
-            self._deliver(NoDoorError(f"cannot ask at {self._address}: {error!r}"))
+            self._deliver(NoDoorError(f"cannot send a stop to {self._address}: {error!r}"))
 
     def _query_until_answered(self) -> CommandReply:
         """Send the request repeatedly until a reply arrives; return the reply.
@@ -151,9 +151,9 @@ class StopCall:
             ) as error:
                 why = error  # the port has closed the connection without a reply
             except OSError as error:
-                raise NoDoorError(f"nobody takes stops at {self._address}: {error}") from error
+                raise NoDoorError(f"no stop port answers at {self._address}: {error}") from error
             self._cancelled.wait(AGAIN_AFTER)
-        raise NoDoorError(f"no answer from {self._address}: {why}")
+        raise NoDoorError(f"no answer from the stop port {self._address}: {why}")
 
     def _try(self, secured: ssl.SSLContext | None, left: float) -> CommandReply:
         with contextlib.ExitStack() as opened:
@@ -167,7 +167,7 @@ class StopCall:
             heard = b""
             while not heard.endswith(b"\n") and len(heard) <= MAX_LINE:
                 if not (more := connection.recv(MAX_LINE)):
-                    raise ConnectionResetError("it has closed the connection")
+                    raise ConnectionResetError("the service has closed the connection")
                 heard += more
         return _read(heard)
 
@@ -193,10 +193,10 @@ def _read(line: bytes) -> CommandReply:
     try:
         answer = decoded(line, StopAnswer)
     except (msgspec.MsgspecError, ValueError) as error:
-        raise NoDoorError(f"somebody else answers at the door for stops: {error}") from error
+        raise NoDoorError(f"the program at the stop port is not a service of trirail: {error}") from error
     if answer.reply is not None:
         return answer.reply
     no = answer.error or ErrorReply(RefusalCode.INTERNAL, "an empty answer")
     if no.code is RefusalCode.UNKNOWN_KEY:
-        raise NoDoorError(f"it is another robot's door for stops: {no.message}")
+        raise NoDoorError(f"the stop port belongs to another robot: {no.message}")
     raise RefusedError(no.code, no.message, slider=no.slider, value=no.value, limit=no.limit)

@@ -99,7 +99,7 @@ class AsyncTrack:
     def _check(self) -> None:
         """Raise the error of an earlier update, if there is one. Raises RefusedError if the track has ended."""
         if (ended := self.result) is not None:
-            raise RefusedError(RefusalCode.JOG_OVER, f"the track is over: {ended.message}")
+            raise RefusedError(RefusalCode.JOG_OVER, f"the track has ended: {ended.message}")
         error, self._error = self._error, None
         if error is not None:
             raise error

@@ -70,7 +70,7 @@ def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
     Raises RefusedError if the trajectory has no points.
     """
     if not points:
-        raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; expected {POINTS_FORMAT}")
+        raise RefusedError(RefusalCode.MALFORMED, f"points: the list is empty; expected {POINTS_FORMAT}")
     x, y, phi = points[0].x, points[0].y, points[0].phi
     return lambda name: PoseGoal(x=x, y=y, phi=phi, id=name)
 
@@ -78,7 +78,7 @@ def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
 def check_arrived(result: Result) -> None:
     """Raise RefusedError if the outcome of the goal to a trajectory's first point is not done."""
     if result.outcome != "done":
-        text = f"the robot is not at the first point of the trajectory, which was not sent: {result.message}"
+        text = f"the trajectory was not sent, because the robot did not reach its first point: {result.message}"
         raise RefusedError(RefusalCode.WRONG_START, text)
 
 
@@ -98,7 +98,9 @@ def parse(name: Path | str, text: str) -> list[TrajectoryPoint]:
     path = Path(name)
     points = _points(path, text)
     if len(points) < MIN_POINTS:
-        raise TrirailError(f"{path}: {'one point' if points else 'no points'}: a trajectory has {MIN_POINTS} at least")
+        raise TrirailError(
+            f"{path}: {'one point' if points else 'no points'}: a trajectory needs at least {MIN_POINTS}"
+        )
     if why := too_many(len(points)):
         raise TrirailError(f"{path}: {why}")
     return points
@@ -127,7 +129,11 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
         raise TrirailError(
             f"{path}: line 1: columns {quoted(', '.join(names)) or 'none'}; expected {', '.join(COLUMNS)}, "
             f"and if known {', '.join(VELOCITY)} and {', '.join(ACCELERATION)}, each once"
-            + ("; commas separate columns, and numbers have a point" if ";" in "".join(names) else "")
+            + (
+                "; separate columns with commas, and write numbers with a decimal point"
+                if ";" in "".join(names)
+                else ""
+            )
         )
     points = []
     for row in rows:
@@ -156,7 +162,7 @@ def _numbers(where: str, names: Sequence[str], row: Sequence[str]) -> dict[str, 
         try:
             values[name] = number_in(cell)
         except ValueError as error:
-            what = f"{where}, column {name}: {error}; a CSV has bare metres, radians and seconds"
+            what = f"{where}, column {name}: {error}; write numbers without units, in metres, radians and seconds"
             raise TrirailError(what) from error
     return values
 

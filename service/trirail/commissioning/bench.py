@@ -255,7 +255,7 @@ class Bench:
         if self.feedback.fault is not None:
             self._drives.reset()
             if (fault := self.wait(RESET_TIMEOUT_S).fault) is not None:
-                raise DrivesStoppedError(f"fault does not clear: {fault.message}")
+                raise DrivesStoppedError(f"the fault cannot be reset: {fault.message}")
 
     def _has_power(self, feedback: Feedback) -> bool:
         return all(feedback.state[index] is PowerState.OPERATION_ENABLED for index in self._powered)

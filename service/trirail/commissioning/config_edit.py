@@ -143,6 +143,6 @@ def write_new_file(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise ConfigError(f"{path} exists already; name another file") from None
+        raise ConfigError(f"{path} already exists; choose another file") from None
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error

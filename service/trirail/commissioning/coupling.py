@@ -112,7 +112,8 @@ def judge_move(seen: MoveObservation, drives: Drives) -> Judgement:
         return Judgement(
             "wrong",
             (by_encoder, by_rule, f"the encoder of drive {name} counts against its motor: with power it runs away"),
-            f"in drive {name} itself: exchange two motor phases, or set the encoder's polarity with its maker's tool, "
+            f"in drive {name} itself: exchange two motor phases, or set the encoder's polarity with the manufacturer's "
+            "tool, "
             "and run its commutation search again; `direction` in the configuration does not help here",
         )
     if abs(seen.out) < MIN_COUNTED_SHARE * min(abs(seen.commanded), abs(seen.rule_out)):
@@ -125,7 +126,8 @@ def judge_move(seen: MoveObservation, drives: Drives) -> Judgement:
         return Judgement(
             "failed",
             (by_encoder, by_rule, seen.stopped),
-            "if the slider moves freely, tune the drive's position loop with its maker's tool, then repeat this step",
+            "if the slider moves freely, tune the drive's position loop with the manufacturer's tool, then repeat this "
+            "step",
         )
     out, back = _Stroke(seen.out, seen.rule_out), _Stroke(seen.back, seen.rule_back - seen.rule_out)
     losses = [abs(stroke.counted) - abs(stroke.rule) for stroke in (out, back)]

@@ -202,7 +202,9 @@ class Guide:
         plan = plan_steps(self._steps, self._config)
         self._report_file.report.plan = tuple((step.name, step.drive) for step in plan)
         if self._report_file.report.simulated:
-            self._operator.show("Simulated drives: brackets show the answer of a person beside them; Enter accepts it.")
+            self._operator.show(
+                "Simulated drives: brackets show the answer that a person would give; Enter accepts it."
+            )
         at = 0
         while at < len(plan):
             step = plan[at]

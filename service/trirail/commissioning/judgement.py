@@ -74,7 +74,7 @@ def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: 
         return Judgement(
             "wrong",
             (*words, f"slider {label(name, labels)} has other switches than these"),
-            f"check their wiring, and the functions of the inputs of drive {name} (its maker's tool)",
+            f"check their wiring, and the functions of the inputs of drive {name} (with the manufacturer's tool)",
         )
     return Judgement("ok", words)
 
@@ -112,7 +112,9 @@ def judge_watchdog(drive: str, seconds: float | None, reporter: str, message: st
     if seconds is not None:
         words = (f"drive {drive} switched its power off {seconds * 1e3:.0f} ms after the last SYNC: {message}",)
         if code == HEARTBEAT_MISSING:
-            return Judgement("ok", (*words, "by its watch on heartbeats: it has none on SYNC, or a slower one"))
+            return Judgement(
+                "ok", (*words, "by monitoring heartbeats: it does not monitor SYNC, or does so more slowly")
+            )
         return Judgement("ok", words)
     if reporter and reporter != drive:
         return Judgement("failed", (f"another drive reported first: {message}",), "repeat this step")

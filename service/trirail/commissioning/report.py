@@ -84,7 +84,7 @@ class ReportFile:
         try:
             path.touch(exist_ok=False)
         except FileExistsError:
-            raise FileError(f"{path} exists already; name another file with --report") from None
+            raise FileError(f"{path} already exists; choose another file with --report") from None
         except OSError as error:
             raise FileError(f"{path}: {error.strerror}") from error
 

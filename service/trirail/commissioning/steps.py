@@ -98,7 +98,7 @@ class Steps:
         bench, read = self.session.bench(), self._environment.inputs
         rest = read(name) if read is not None else None
         if read is None or rest is None:
-            reason = f"drive {name} does not report its digital inputs (60FDh): check them with its maker's tool"
+            reason = f"drive {name} does not report its digital inputs (60FDh): check them with the manufacturer's tool"
             return Judgement("skipped", (reason,)), {}
         changed, cycles, slider = 0, 0, f"slider {self.slider_label(name)}"
 

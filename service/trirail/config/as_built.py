@@ -101,9 +101,9 @@ def read(path: Path) -> AsBuilt:
     try:
         return parse(files.text(path))
     except FileError as error:
-        raise ConfigError(f"{error}; {MAKE} makes one") from error
+        raise ConfigError(f"{error}; create one with {MAKE}") from error
     except ConfigError as error:
-        raise ConfigError(f"{path}: invalid map of as-built errors: {error}; {MAKE} makes one") from error
+        raise ConfigError(f"{path}: invalid map of as-built errors: {error}; create one with {MAKE}") from error
 
 
 def parse(text: str) -> AsBuilt:
@@ -159,13 +159,14 @@ def check(as_built: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, s
     errors = correction(as_built)
     if as_built.geometry != geometry_of(robot):
         raise ConfigError(
-            f"it was measured with another [geometry] ({as_built.geometry}, here {geometry_of(robot)}): "
-            f"measure again, and {MAKE} with this configuration"
+            f"the map was measured with another [geometry] ({as_built.geometry}, here {geometry_of(robot)}): "
+            f"measure again, then run {MAKE} with this configuration"
         )
     for k, (name, unit) in enumerate(COORDINATES):
         if as_built.low[k] > room.low[k] or as_built.high[k] < room.high[k]:
             raise ConfigError(
-                f"it covers {name} from {as_built.low[k]:g} to {as_built.high[k]:g} {unit}, limits.platform.{name} is "
+                f"the map covers {name} from {as_built.low[k]:g} to {as_built.high[k]:g} {unit}, but "
+                f"limits.platform.{name} is "
                 f"[{room.low[k]:g}, {room.high[k]:g}]: measure that range, or reduce the limit"
             )
     rates = np.array(platform, dtype=np.float64)
@@ -220,5 +221,5 @@ def _steep(place: Array, effect: str, limit: str) -> str:
     x, y, phi = (worded(value, unit) for value, unit in zip(place.tolist(), ("m", "m", "rad"), strict=True))
     return (
         f"too steep near x {x}, y {y}, phi {phi}: it {effect}, the limits allow {limit}; "
-        "measure there again, use fewer cells, or calibrate [geometry] before"
+        "measure there again, use fewer cells, or calibrate [geometry] first"
     )

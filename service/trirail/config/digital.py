@@ -83,7 +83,7 @@ def _check_bit(key: str, bit: int, index: str, reserved: Mapping[int, str]) -> N
     if bit < FIRST_BIT:
         raise ConfigError(
             f"{key}.bit = {bit}: bit {bit} of object {index} {reserved.get(bit, 'is reserved')} in CiA 402; use one of "
-            f"{FIRST_BIT} to {LAST_BIT}, from the maker's manual"
+            f"{FIRST_BIT} to {LAST_BIT}, as in the manufacturer's manual"
         )
 
 
@@ -93,14 +93,14 @@ def _check_single(kind: str, name: str, pins: Mapping[str, Output | Input]) -> N
     for other, each in itertools.takewhile(lambda item: item[0] != name, pins.items()):
         if (each.drive, each.bit) == (pin.drive, pin.bit):
             raise ConfigError(
-                f"{kind}s.{name}.bit = {pin.bit}: bit {pin.bit} of drive {pin.drive} is {kind} {other} "
-                "already; use another bit, or one of the two names"
+                f"{kind}s.{name}.bit = {pin.bit}: bit {pin.bit} of drive {pin.drive} already "
+                f"belongs to {kind} {other}; use another bit, or only one of the two names"
             )
 
 
 def _check_name(name: str, outputs: Mapping[str, Output]) -> None:
     if name in outputs:
-        raise ConfigError(f"inputs.{name}: an output is called {name} already; use another name")
+        raise ConfigError(f"inputs.{name}: the name {name} already belongs to an output; use another name")
 
 
 def digital_io(outputs: Mapping[str, Output], inputs: Mapping[str, Input]) -> DriveIo:

@@ -146,7 +146,7 @@ def _wrong_names(table: dict[str, Any], kind: mi.DictType, place: Place) -> Iter
         if _accepts(kind.key_type, name):
             yield from _wrong_values(value, kind.value_type, (*place, name))
         else:
-            text = f"{_key(place)}: {name!r} is no name here: expected {expected(kind.key_type)}"
+            text = f"{_key(place)}: {name!r} is not a valid name here: expected {expected(kind.key_type)}"
             yield _WrongValue((*place, name), text, None)
 
 

@@ -164,7 +164,7 @@ def _check_settling(config: Config) -> None:
 
 def _check_frame(name: str) -> None:
     if name in (BASE, PLATFORM):
-        raise ConfigError(f"frames.work.{name}: the name is reserved for the robot's own frame; use another")
+        raise ConfigError(f"frames.work.{name}: the name is reserved for the robot's own frame; use another name")
 
 
 def _check_rate(config: Config) -> None:
@@ -206,7 +206,7 @@ def _check_correction(config: Config) -> None:
     if table.as_built is None:
         if table.map is not None:
             raise ConfigError(
-                f"correction.map = {table.map!r}: only a configuration that is read from a file can name one"
+                f"correction.map = {table.map!r}: only a configuration that is read from a file can name a map"
             )
         return
     try:

@@ -80,7 +80,9 @@ def _read(path: Path) -> tuple[Config, list[Mistake]]:
         text = files.text(path)
     except FileError as error:
         without_path = str(error).removeprefix(f"{path}: ")
-        raise ConfigError(f"{without_path}; `trirail config copy sim` makes one to start from") from error
+        raise ConfigError(
+            f"{without_path}; create a configuration to start from with `trirail config copy sim`"
+        ) from error
     config, wrong = repaired(toml_tables(text))
     return _resolve_paths(path, config, wrong), wrong
 

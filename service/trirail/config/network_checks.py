@@ -72,21 +72,21 @@ def reach_rules(zenoh: Zenoh) -> Iterator[Rule]:
 
 def _check_connect(zenoh: Zenoh) -> None:
     if zenoh.tls is not None and zenoh.connect and zenoh.router is None:
-        raise ConfigError(
-            "zenoh.connect: where [zenoh.tls] is used, zenoh.router must be the name in the router's certificate"
-        )
+        raise ConfigError("zenoh.connect: with [zenoh.tls], zenoh.router must be the name in the router's certificate")
 
 
 def _check_router(zenoh: Zenoh) -> None:
     if zenoh.router is not None and not (zenoh.tls and zenoh.connect):
-        raise ConfigError("zenoh.router: it has an effect only with [zenoh.tls] and zenoh.connect")
+        raise ConfigError("zenoh.router: this setting needs [zenoh.tls] and zenoh.connect")
     if zenoh.router in zenoh.users:
         raise ConfigError(f"zenoh.router: {zenoh.router} is also a user; use another name for the router")
 
 
 def _check_users(zenoh: Zenoh) -> None:
     if zenoh.users and zenoh.tls is None:
-        raise ConfigError("zenoh.users: without [zenoh.tls] users have no verified names; add it, or remove users")
+        raise ConfigError(
+            "zenoh.users: without [zenoh.tls], the names of users are not verified; add [zenoh.tls], or remove users"
+        )
 
 
 def _check_endpoint(name: str, endpoint: str, zenoh: Zenoh) -> None:
@@ -95,12 +95,12 @@ def _check_endpoint(name: str, endpoint: str, zenoh: Zenoh) -> None:
         raise ConfigError(f"{key}: {fault}")
     if zenoh.tls is not None and by is not ReachableBy.CERTIFICATE:
         raise ConfigError(
-            f"{key}: with [zenoh.tls] every endpoint must be tls/ADDRESS:PORT, else it bypasses the certificates"
+            f"{key}: with [zenoh.tls] every endpoint must be tls/ADDRESS:PORT, because others bypass the certificates"
         )
     if zenoh.tls is not None and "#" in endpoint:
         raise ConfigError(f"{key}: settings after # would bypass [zenoh.tls]; remove them")
     if zenoh.tls is None and by is ReachableBy.CERTIFICATE:
-        raise ConfigError(f"{key}: it needs [zenoh.tls], with the certificates that `trirail keys init` makes")
+        raise ConfigError(f"{key}: tls needs [zenoh.tls] and certificates: create them with `trirail keys init`")
     if by is ReachableBy.NETWORK and not zenoh.insecure:
         raise ConfigError(
             f"{key}: anyone on its network can move the robot; use tls/ with [zenoh.tls] (trirail keys init), "

@@ -411,8 +411,9 @@ def _labels(table: GeometryTable) -> Labels:
         others = [word for other in NAMES if other != name for word in (other, labels[other])]
         if label.casefold() in (word.casefold() for word in (*others, "n", "q")):
             raise ConfigError(
-                f"geometry.labels: {label} for slider {name}: use no label or letter of another slider, "
-                "and neither n nor q, which are answers to trirail commission"
+                f"geometry.labels: {label} for slider {name} is not allowed: choose a label that is not the label or "
+                "letter "
+                "of another slider, and not n or q, which are answers to trirail commission"
             )
     return table.labels
 
@@ -428,8 +429,8 @@ def _leg(kind: str, name: str, table: LegTable) -> AnyLeg:
         for key in keys:
             if other != kind and getattr(table, key) is not None:
                 raise ConfigError(
-                    f"geometry: leg {name} has {key}, which is of kind {other} ({_KIND_WORDS[other]}); "
-                    f"kind is {kind}, with {' and '.join(_LEG_KEYS[kind])}"
+                    f"geometry: leg {name} has {key}, a key of kind {other} ({_KIND_WORDS[other]}); "
+                    f"kind is {kind}, whose keys are {' and '.join(_LEG_KEYS[kind])}"
                 )
     point, angle = (getattr(table, key) for key in _LEG_KEYS[kind])
     if point is None or (angle is None and kind == "3-PRP"):

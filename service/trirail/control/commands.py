@@ -56,7 +56,11 @@ def powered_up(now: CommandProgress) -> str | None:
     """Return "" once the drives have power and the robot has left the mode ENABLING without a failure."""
     if now.mode is Mode.ENABLING:
         return None
-    return "" if now.mode not in (Mode.FAULT, Mode.DISABLED) else now.latched or "disabled while powering up"
+    return (
+        ""
+        if now.mode not in (Mode.FAULT, Mode.DISABLED)
+        else now.latched or "the robot was disabled while the drives were powering up"
+    )
 
 
 def powered_down(now: CommandProgress) -> str | None:
@@ -73,13 +77,13 @@ def homed(now: CommandProgress) -> str | None:
     """Return "" once every slider is homed."""
     if now.mode in (Mode.HOMING, Mode.STOPPING):
         return None
-    return "" if now.measured.homed else now.latched or "stopped before every drive was homed"
+    return "" if now.measured.homed else now.latched or "homing was stopped before all drives were homed"
 
 
 def cleared(now: CommandProgress) -> str | None:
     """Return "" once neither the robot nor a drive is in fault."""
     if now.mode is Mode.FAULT:
-        return f"the cause is still there: {now.latched}"
+        return f"the cause of the fault persists: {now.latched}"
     return "" if now.settled and not any(state in _FAULTY for state in now.measured.feedback.state) else None
 
 
@@ -93,7 +97,7 @@ def powered_message(measured: MeasuredState, latched: str | None) -> str:
     """Return the refusal of a reset that is sent while drives can still move. The message names these drives."""
     states = zip(NAMES, measured.feedback.state, strict=True)
     drives = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
-    return f"{drives} by its last statusword: send reset again when the drives are at rest (fault: {latched})"
+    return f"{drives} according to the last statusword: send reset again when the drives are at rest (fault: {latched})"
 
 
 SETTLE = 0.1
@@ -158,7 +162,7 @@ class Commands:
         if action is Action.CLEAR and self._measured.powered:
             raise RefusedError(RefusalCode.STOPPING, powered_message(self._measured, self._modes.fault))
         if action is Action.CLEAR and (unready := self._measured.unready):
-            raise RefusedError(RefusalCode.FAULT, f"the cause is still there: {'; '.join(unready)}")
+            raise RefusedError(RefusalCode.FAULT, f"the cause of the fault persists: {'; '.join(unready)}")
         if event is ModeEvent.QUICK_STOP:
             self._modes.trip(reason, FaultCause.QUICK_STOP)
         else:
@@ -173,14 +177,14 @@ class Commands:
 
     def _home(self, request: CommandRequest) -> None:
         if not self._can_home:
-            raise RefusedError(RefusalCode.NOTHING_TO_HOME, "absolute encoders: there is nothing to home")
+            raise RefusedError(RefusalCode.NOTHING_TO_HOME, "the encoders are absolute: homing is not needed")
         self._change_mode(request)
 
     def _override(self, request: CommandRequest) -> None:
         """Set the speed override for the current motion and all later motions."""
         rate = self._planner.override = request.content.percent / 100.0
         self._planner.update_rate()
-        words = f"override {rate:.0%} by {request.user}"
+        words = f"override set to {rate:.0%} by {request.user}"
         text = coded(words, EventCode.OVERRIDE, percent=request.content.percent, user=request.user)
         self._ledger.notices.append(Notice("service", "info", text.text, user=request.user, **text.fields))
 
@@ -188,7 +192,7 @@ class Commands:
         """Set an output. The output switches together with the next setpoints."""
         name, value = request.content.output, request.content.value
         self._outputs.set(name, value, self._modes.state.mode)
-        words = f"output {name} {'on' if value else 'off'} by {request.user}"
+        words = f"output {name} switched {'on' if value else 'off'} by {request.user}"
         text = coded(words, EventCode.OUTPUT_SET, output=name, on=float(value), user=request.user)
         self._ledger.notices.append(Notice("output", "info", text.text, user=request.user, **text.fields))
 

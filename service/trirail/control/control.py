@@ -269,7 +269,7 @@ class Control:
             if behind:
                 error, limit = self.measured.following_error[behind - 1], self._following_error_limit
                 slider = self._labels[behind - 1]
-                words = f"slider {slider}: following error {error * 1e3:.3f} mm is beyond its limit {limit * 1e3:g} mm"
+                words = f"slider {slider}: following error {error * 1e3:.3f} mm exceeds the limit of {limit * 1e3:g} mm"
                 text = coded(words, EventCode.FOLLOWING_ERROR, slider=slider, value=error, limit=limit)
                 self.modes.trip(text, FaultCause.FOLLOWING_ERROR, NAMES[behind - 1])
             elif not feedback.homing:
@@ -322,7 +322,9 @@ class Control:
     def _report_switches(self, *, all_: bool = False) -> None:
         for switches in self.outputs.pop_switches(self.modes.cycle, all_=all_):
             goal, number = switches[-1].goal, len(switches)
-            text = coded(f"{number} outputs switched", EventCode.OUTPUTS_SWITCHED, goal=goal, number=number)
+            text = coded(
+                f"outputs switched on the path: {number}", EventCode.OUTPUTS_SWITCHED, goal=goal, number=number
+            )
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
 
     def _handle_edges(self, before: Feedback, now: Feedback) -> None:
@@ -331,7 +333,8 @@ class Control:
         x, y, phi = pose
         for name, value in self.outputs.edges(before.inputs, now.inputs):
             words = (
-                f"input {name} {'on' if value else 'off'} at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm, phi {phi:.5f} rad"
+                f"input {name} switched {'on' if value else 'off'} at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm, phi "
+                f"{phi:.5f} rad"
             )
             text = coded(words, EventCode.INPUT_CHANGED, input=name, on=float(value), x=x, y=y, phi=phi)
             self.ledger.notices.append(Notice("input", "info", text.text, **text.fields))
@@ -471,8 +474,9 @@ class Control:
         if self.state.paused or (self.override == 0.0 and self.schedule.last is not None):
             raise RefusedError(
                 RefusalCode.MOVING,
-                "a goal waits on its path, and a move would count from its end: send stop first, or resume it, or move "
-                "from where the robot is measured to be",
+                "a goal waits on its path, and the move would start from the end of that path: send stop or resume "
+                "first, "
+                'or send the move with "from": "measured"',
             )
         return self._end_pose
 
@@ -540,7 +544,7 @@ class Control:
                 if state is not PowerState.OPERATION_ENABLED
             ]
             seconds = self._enable_cycles * self._period
-            words = f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected"
+            words = f"not all drives were enabled within {seconds:g} s: {', '.join(waiting)}"
             names = [
                 name
                 for name, state in zip(self._labels, self.measured.feedback.state, strict=True)

@@ -185,13 +185,13 @@ class GoalQueue:
                 self._waiting.remove(sent)
                 self._ledger.withdraw(sent.request, "stopped", reason.text)
                 return True
-        raise RefusedError(RefusalCode.NO_GOAL, f"goal {goal_id!r} is not under way: it has ended, or never was")
+        raise RefusedError(RefusalCode.NO_GOAL, f"goal {goal_id!r} is not in progress: it has ended or was never sent")
 
     def expire(self, cycle: int) -> None:
         """End planned goals that can no longer begin in time, together with the goals that follow them."""
         for number, goal in enumerate(self._ledger.goals):
             if number and cycle > goal.expires:
-                self._drop(number, goal.id, "expired", coded("it did not begin in time", EventCode.TOO_LATE))
+                self._drop(number, goal.id, "expired", coded("the goal did not start in time", EventCode.TOO_LATE))
                 return
 
     def _next(self) -> _ReceivedGoal:
@@ -222,7 +222,9 @@ class GoalQueue:
         planned = self._timed(resolve_goal(goal, self._frames, place), sent, cycle)
         blend = ledger.goals[-1].blend if moving and ledger.goals and goal.follows else None
         if blend is not None and len(ledger.goals) > self._queue:
-            text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
+            text = (
+                f"the goal queue is full ({self._queue} goals, motion.queue): send the goal when another goal has ended"
+            )
             raise RefusedError(RefusalCode.QUEUE_FULL, text, value=len(ledger.goals), limit=self._queue)
         self._outputs.check_marks(planned.marks)
         if planned.stop_at is not None:
@@ -242,15 +244,15 @@ class GoalQueue:
         if ago > MAX_TARGET_AGE_S >= abs(sent.request.age):
             waited = ago - sent.request.age
             text = (
-                f"the report of the target has waited {waited:.3f} s behind its sender's other messages: "
-                "send fewer per second"
+                f"the target has waited {waited:.3f} s for earlier messages of its sender to be read: "
+                "send fewer messages per second"
             )
             raise RefusedError(RefusalCode.BUSY, text, value=waited)
         if not abs(ago) <= MAX_TARGET_AGE_S:
             when = f"{ago:.3f} s ago" if ago > 0.0 else f"in {-ago:.3f} s"
             text = (
-                f"the time of the target is {when} by this machine's clock: {MAX_TARGET_AGE_S:g} s is the maximum; "
-                "synchronise the clocks"
+                f"the time of the target is {when} by this machine's clock; the maximum is {MAX_TARGET_AGE_S:g} s: "
+                "synchronise the clocks of both machines"
             )
             raise RefusedError(RefusalCode.WRONG_TIME, text, value=ago, limit=math.copysign(MAX_TARGET_AGE_S, ago))
         return planned.at(self._schedule.cycle * self._period - ago)
@@ -259,7 +261,7 @@ class GoalQueue:
         """Report that a goal is waiting because the planner is busy. Only one report is sent per busy period."""
         busy = self._planner.busy_message
         if busy and not self._busy_reported:
-            words, silence = f"{busy}: goal {request.id} waits", self._planner.silence
+            words, silence = f"{busy}: goal {request.id} is waiting", self._planner.silence
             text = coded(words, EventCode.PLANNER_BUSY, goal=request.id, silence=silence)
             self._ledger.notices.append(Notice("service", "warning", text.text, user=request.user, **text.fields))
         self._busy_reported = bool(busy)
@@ -269,11 +271,9 @@ class GoalQueue:
         valid = sent.request.goal.valid_for
         why = f"; {self._planner.busy_message}" if self._planner.busy_message else ""
         if valid is not None and cycle - sent.cycle > valid / self._period:
-            raise RefusedError(RefusalCode.EXPIRED, f"the goal is too late: it was valid for {valid:g} s{why}")
+            raise RefusedError(RefusalCode.EXPIRED, f"the goal did not start within its valid_for of {valid:g} s{why}")
         if cycle > self._alive_until(sent):
-            raise RefusedError(
-                RefusalCode.EXPIRED, f"the goal is too late: its timeout has elapsed before it could begin{why}"
-            )
+            raise RefusedError(RefusalCode.EXPIRED, f"the timeout of the goal elapsed before the goal could start{why}")
 
     def _alive_until(self, sent: _ReceivedGoal) -> float:
         """Return the cycle in which the goal ends without a renewal; infinite if the goal needs no renewals."""
@@ -281,7 +281,7 @@ class GoalQueue:
 
     def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: EventText) -> None:
         """End a planned goal and the goals that follow it."""
-        words = f"goal {goal_id} before it {outcome}"
+        words = f"the earlier goal {goal_id} {outcome}"
         before = coded(words, EventCode.EARLIER_GOAL_ENDED, goal=goal_id, outcome=outcome)
         self._ledger.end("stopped", before, but=number + 1)
         self._ledger.end(outcome, reason, but=number)

@@ -115,7 +115,7 @@ class Settling:
         residuals = [f"slider {name} {error * 1e3:.3f} mm" for name, error in errors]
         residuals += [f"x {x * 1e3:.3f} mm", f"y {y * 1e3:.3f} mm", f"phi {phi * 1e3:.3f} mrad"]
         words = (
-            f"not in position {self._limits.timeout:g} s after the end of its path; "
+            f"not in position {self._limits.timeout:g} s after the end of the path; "
             f"residuals: {', '.join(residuals)} (limits.in_position)"
         )
         return coded(words, EventCode.NOT_IN_POSITION, timeout=self._limits.timeout)

@@ -60,11 +60,11 @@ class LeaseArbiter:
             if self._required:
                 raise RefusedError(
                     RefusalCode.NO_LEASE,
-                    "nobody holds the lease, and the robot moves for its holder alone: send acquire first",
+                    "no user holds the lease, which this robot requires for motion: send acquire first",
                 )
         elif self._held.user != user:
             raise RefusedError(
-                RefusalCode.LEASED, f"{self._held.user} holds the lease: goals and commands of others are refused"
+                RefusalCode.LEASED, f"{self._held.user} holds the lease: goals and commands of other users are refused"
             )
 
     def acquire(self, user: str, lease: AcquireLease, cycle: int) -> LeaseChange | None:
@@ -75,7 +75,7 @@ class LeaseArbiter:
         """
         before = self._held
         if lease.id is not None and (why := self._ended.get((user, lease.id))) is not None:
-            raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: acquire a new one")
+            raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: acquire a new lease")
         again = before is not None and (before.user, before.id) == (user, lease.id)
         change = (
             None
@@ -101,16 +101,16 @@ class LeaseArbiter:
         if lease.id is not None and (why := self._ended.get((user, lease.id))) is not None:
             raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: there is nothing to release")
         if held is None:
-            raise RefusedError(RefusalCode.NO_LEASE, "nobody holds the lease: there is nothing to release")
+            raise RefusedError(RefusalCode.NO_LEASE, "no user holds the lease: there is nothing to release")
         whose = "another client of the same user" if held.user == user else held.user
-        raise RefusedError(RefusalCode.LEASED, f"{whose} holds the lease, and only its holder can release it")
+        raise RefusedError(RefusalCode.LEASED, f"{whose} holds the lease: only the holder can release it")
 
     def expire(self, cycle: int) -> LeaseChange | None:
         """End the lease if it was not renewed in time. Return None if there is no lease or the lease is still valid."""
         held = self._held
         if held is None or cycle <= held.alive_until:
             return None
-        words = f"lease of {held.user} is over: no sign of life for {held.timeout:g} s"
+        words = f"lease of {held.user} has expired: it was not renewed within {held.timeout:g} s"
         expired = coded(words, EventCode.LEASE_EXPIRED, user=held.user, timeout=held.timeout)
         return self._end("warning", expired)
 

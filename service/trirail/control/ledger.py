@@ -75,11 +75,11 @@ class _GoalEnd(NamedTuple):
     def renewal_error(self, goal_id: str) -> RefusedError:
         """Return the error for a renewal that arrives after the end of this goal."""
         if self.bound is not None:
-            text = f"jog {goal_id!r} has ended at the limit of {self.bound}: begin a new one, away from it"
+            text = f"jog {goal_id!r} has ended at the limit of {self.bound}: start a new jog away from this limit"
             return RefusedError(RefusalCode.AT_LIMIT, text)
         if self.outcome == "done":
             return _not_renewed(goal_id)
-        text = f"goal {goal_id!r} is over, {self.outcome}: {self.reason}; begin a new one"
+        text = f"goal {goal_id!r} has ended ({self.outcome}: {self.reason}); start a new goal"
         return RefusedError(RefusalCode.JOG_OVER, text)
 
 
@@ -113,7 +113,9 @@ class Ledger:
         if ended is not None and ended.kind.renewed and (ended.kind, ended.user) == (type(request.goal), request.user):
             raise ended.renewal_error(goal_id)
         if ended is not None or (running and not self.renewed_by(request)):
-            raise RefusedError(RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has been used: every goal needs its own")
+            raise RefusedError(
+                RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has already been used: give every goal its own id"
+            )
         if self.goal is not None and self.goal.released and self.renewed_by(request):
             raise _not_renewed(goal_id)
 
@@ -236,7 +238,7 @@ class Ledger:
         text = answered = str(refusal)
         if isinstance(request, GoalRequest) and request.goal.frequent and not self.renewed_by(request):
             ended = refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER)
-            answered = text if ended else f"{text}; goal {request.id!r} is over, begin a new one"
+            answered = text if ended else f"{text}; goal {request.id!r} has ended: start a new goal"
         self.answers.append(
             Refused(request.ticket, refusal.code, answered, refusal.slider, refusal.value, refusal.limit)
         )
@@ -341,4 +343,6 @@ def _with_code(notice: Notice, refusal: RefusedError) -> Notice:
 
 
 def _not_renewed(goal_id: str) -> RefusedError:
-    return RefusedError(RefusalCode.JOG_OVER, f"goal {goal_id!r} was not renewed in time and is over: begin a new one")
+    return RefusedError(
+        RefusalCode.JOG_OVER, f"goal {goal_id!r} was not renewed in time and has ended: start a new goal"
+    )

@@ -94,17 +94,19 @@ FAULT = ModeState(Mode.FAULT)
 
 _NO_FAULT = Refusal(RefusalCode.NO_FAULT, "there is no fault to reset")
 _DISABLED = Refusal(RefusalCode.NOT_ENABLED, "the robot is disabled: send enable first")
-_ENABLING = Refusal(RefusalCode.NOT_ENABLED, "the drives are still powering up: send it again when the mode is holding")
-_HOMING = Refusal(RefusalCode.HOMING, "the robot is homing: send the goal when the mode is holding")
+_ENABLING = Refusal(
+    RefusalCode.NOT_ENABLED, "the drives are still powering up: repeat the request when the mode is holding"
+)
+_HOMING = Refusal(RefusalCode.HOMING, "the robot is homing: repeat the request when the mode is holding")
 _MOVING = Refusal(RefusalCode.MOVING, "the robot is moving: send stop, then home")
 _PAUSED = Refusal(RefusalCode.MOVING, "a goal is paused: send stop, then home")
-_STOPPING = Refusal(RefusalCode.STOPPING, "the robot is stopping: send it again when the mode is holding")
+_STOPPING = Refusal(RefusalCode.STOPPING, "the robot is stopping: repeat the request when the mode is holding")
 _DISABLING = Refusal(
-    RefusalCode.STOPPING, "the robot is stopping to be disabled: send enable when the mode is disabled"
+    RefusalCode.STOPPING, "the robot is stopping and will then be disabled: send enable when the mode is disabled"
 )
 _FAULT = Refusal(RefusalCode.FAULT, "the robot is in fault: remove the cause, then send reset and enable")
 
-_NO_GOAL = Refusal(RefusalCode.NO_GOAL, "there is no goal under way")
+_NO_GOAL = Refusal(RefusalCode.NO_GOAL, "no goal is in progress")
 _NOT_PAUSED = Refusal(RefusalCode.NOT_PAUSED, "there is no paused goal to resume")
 
 _POWER_OFF = Step(DISABLED, Action.POWER_DOWN)

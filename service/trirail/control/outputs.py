@@ -229,8 +229,8 @@ class Outputs:
             safe, where = "on" if output.safe else "off", "in fault" if mode is Mode.FAULT else mode
             raise RefusedError(
                 code,
-                f"output {name!r} keeps its safe value, {safe}, while the robot is {where}: "
-                "send enable first, or set always = true in its section of the configuration",
+                f"output {name!r} stays at its safe value, {safe}, while the robot is {where}: "
+                "send enable first, or set always = true for this output in the configuration",
             )
         row = self.state[self._names.index(name)]
         row["until"] = row["goal"] = 0
@@ -284,8 +284,9 @@ class Outputs:
             if not self._path_allowed[NAMES.index(drive)]:
                 raise RefusedError(
                     RefusalCode.BAD_MARK,
-                    f"output {mark.output!r} cannot switch on a path: drive {drive} takes 60FEh by SDO only, not with "
-                    "a setpoint; use set_output, or an output of another drive",
+                    f"output {mark.output!r} cannot switch on a path, because drive {drive} accepts object 60FEh only "
+                    "by "
+                    "SDO: use set_output, or an output of another drive",
                 )
 
     def prepare(self, run: Run | None, version: int) -> None:

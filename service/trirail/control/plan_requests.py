@@ -134,7 +134,7 @@ class PlanRequests:
     def busy_message(self) -> str:
         """Message to the user that the planner is busy; empty if the planner is not busy."""
         silence = self.silence
-        return f"the planner is busy, no answer for {silence:.1f} s" if silence > BUSY_AFTER_S else ""
+        return f"the planner is busy and has not answered for {silence:.1f} s" if silence > BUSY_AFTER_S else ""
 
     def warm_up(self) -> None:
         """Compute a rate change for a schedule that is never executed, because the first call of the code is slow."""
@@ -232,7 +232,7 @@ class PlanRequests:
     def _request_plan(self, goal: Goal) -> None:
         """Request a motion from the current motion to the goal. Raises RefusedError after too many requests."""
         if self._attempts == len(self._leads):
-            text = f"{self._attempts} plans came too late, or the motion under way changed: send the goal again"
+            text = f"no plan was ready in time in {self._attempts} attempts: send the goal again"
             raise RefusedError(RefusalCode.NO_PLAN, text)
         schedule, (pose, velocity, acceleration) = self._schedule, self._schedule.commanded
         self._number += 1
@@ -270,7 +270,9 @@ class PlanRequests:
         try:
             accepted = self._extend(answer) if isinstance(answer, PathExtension) else self._preempt(answer)
         except ValueError as error:
-            raise RefusedError(RefusalCode.PLANNER_LOST, f"the planner's answer is not a motion: {error}") from error
+            raise RefusedError(
+                RefusalCode.PLANNER_LOST, f"the planner's answer is not a valid motion: {error}"
+            ) from error
         if accepted is not None:
             self.cancel()
         return accepted

@@ -43,13 +43,13 @@ class ReturningDrives:
         label, position, last = self._labels[i], feedback.position[i], self._last[i]
         waiting = any(each is not None for each in feedback.unready)
         if waiting:
-            words = f"drive {label} is configured; when every drive is, send reset"
+            words = f"drive {label} is configured: send reset when all drives are configured"
             yield "info", coded(words, EventCode.DRIVE_READY, drive=label)
         else:
-            words = f"drive {label} is configured, as all drives are now: send reset, then enable"
+            words = f"drive {label} is configured, and so are the others: send reset, then enable"
             yield "info", coded(words, EventCode.DRIVES_READY, drive=label)
         if not feedback.homed[i]:
-            words = f"slider {label}: position unknown since its drive was off: send home"
+            words = f"slider {label}: the position is unknown because the drive was off; send home"
             yield "warning", coded(words, EventCode.POSITION_UNKNOWN, slider=label)
         elif last is not None and abs(position - last) > self._windows[i]:
             moved = (

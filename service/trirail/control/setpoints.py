@@ -152,7 +152,7 @@ class Setpoints:
             if not abs(setpoint - position) <= self.step:
                 raise RefusedError(
                     RefusalCode.NOT_AT_REST,
-                    f"slider {name} moves too fast for its setpoint to follow: enable when it is at rest",
+                    f"slider {name} moves faster than its setpoint can follow: send enable when the slider is at rest",
                 )
 
     def check_start(self) -> EventText | None:
@@ -167,11 +167,13 @@ class Setpoints:
         if pose is None or inverse_into(self._legs, self._motion, self._tried):
             raise RefusedError(
                 RefusalCode.SINGULAR,
-                "the measured slider positions do not correspond to any pose: move them by hand, then enable",
+                "the measured slider positions do not correspond to any pose: move the sliders by hand, then send "
+                "enable",
             )
         if sign_of_det_j2(self._legs, pose) != sign_of_det_j2(self._legs, ZERO_RATES):
             raise RefusedError(
-                RefusalCode.SINGULAR, "the robot is behind a singular pose: move it back by hand, then enable"
+                RefusalCode.SINGULAR,
+                "the robot has passed a singular pose: move the platform back by hand, then send enable",
             )
         self._tried[0] += self._measured.backlash[0]["offset"]
         violation = self._bounds.standing_violation(
@@ -179,7 +181,7 @@ class Setpoints:
         )
         if violation is None:
             return None
-        words = f"the robot is outside its limits, only motion back is accepted: {violation}"
+        words = f"the robot is outside its limits, and only motion back towards them is accepted: {violation}"
         return coded(
             words,
             EventCode.OUTSIDE_LIMITS,

@@ -41,7 +41,13 @@ def _bounds(config: Config) -> Iterator[_Bounds]:
     )
     unreachable = dogs.gateway_timeout
     yield _Bounds(
-        "watchdogs.gateway_timeout", unreachable, unreachable, 0.0, 3.0, "", "nobody could stop the robot for that time"
+        "watchdogs.gateway_timeout",
+        unreachable,
+        unreachable,
+        0.0,
+        3.0,
+        "",
+        "the robot could not be stopped for that time",
     )
     blind = drives.missed_positions * period
     unseen = "a drive could be silent in motion for that time"
@@ -126,7 +132,7 @@ def _homing(config: Config) -> Iterator[Check]:
         distance = homing.speed_switch**2 / (2.0 * homing.acceleration)
         if distance > travel / 20.0 or homing.speed_switch / homing.acceleration < 1e-3:
             finding = (
-                f"{key}.acceleration = {homing.acceleration:g} m/s²: it stops {distance * 1e3:.2g} mm behind its switch"
+                f"{key}.acceleration = {homing.acceleration:g} m/s²: it stops {distance * 1e3:.2g} mm past its switch"
             )
             yield Check("homing", "warning", finding, "check its unit", f"{key}.acceleration")
 

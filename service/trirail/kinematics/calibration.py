@@ -74,7 +74,7 @@ def identify(
     """
     if len(poses) < MINIMUM:
         raise CalibrationError(
-            f"{len(poses)} poses are too few: at least {MINIMUM} are required, and some dozens recommended"
+            f"{len(poses)} poses are too few: at least {MINIMUM} are required, and some dozens are recommended"
         )
     for name, value in (("position", position_noise), ("angle", angle_noise)):
         if not (math.isfinite(value) and value > 0.0):
@@ -110,13 +110,15 @@ def identify(
     if misfit > MISFIT:
         row, _ = divmod(int(np.argmax(np.abs(solution.fun))), 3)
         raise CalibrationError(
-            f"no geometry fits: the residuals are {misfit:.3g} times the stated noise, and greatest at this pose, "
-            f"{np.max(np.abs(solution.fun)):.3g} times; check it, the columns and the units, or state more noise",
+            f"no geometry fits: the residuals are {misfit:.3g} times the stated noise, and at this pose, the worst, "
+            f"{np.max(np.abs(solution.fun)):.3g} times; check this pose, the columns and the units, or state more "
+            "noise",
             row=row,
         )
     if not solution.success:
         raise CalibrationError(
-            f"no convergence after {solution.nfev} steps: the poses vary too little; vary them more, phi above all"
+            f"no convergence after {solution.nfev} steps: the poses vary too little; vary the poses more, above all in "
+            "phi"
         )
     deviations = (basis @ np.linalg.pinv(solution.jac)).reshape(3, 5, -1)
     errors = np.sqrt(np.sum(deviations**2, axis=2))
@@ -163,7 +165,7 @@ def _check(start: Geometry, poses: Array, sliders: Array) -> None:
             forward(start, reading, near=pose)
         except KinematicsError as error:
             raise CalibrationError(
-                f"out of the starting geometry's reach, or the columns or units are wrong: {error}", row=row
+                f"a pose is out of reach of the starting geometry, or the columns or units are wrong: {error}", row=row
             ) from error
 
 
@@ -197,6 +199,7 @@ def _separate(start: Geometry, derivatives: Array) -> tuple[Array, tuple[Open, .
             unknown.append(Open(leg, names, len(rest)))
     if not columns:
         raise CalibrationError(
-            "the stated noise is too large: the poses determine nothing that drawings do not; state less, or add poses"
+            "the stated noise is too large: the poses determine nothing better than drawings do; state less noise, or "
+            "add poses"
         )
     return np.stack(columns, axis=1), tuple(unknown)

@@ -73,9 +73,9 @@ class Correction:
         if nodes.ndim != 4 or nodes.shape[3] != 3 or min(nodes.shape[:3]) <= DEGREE:
             raise KinematicsError(f"a correction has nodes of shape {nodes.shape}: expected (l + 3, m + 3, n + 3, 3)")
         if not (np.isfinite(nodes).all() and all(map(math.isfinite, (*self.low, *self.high)))):
-            raise KinematicsError("a correction has a number that is not finite")
+            raise KinematicsError("a correction contains a number that is not finite")
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
-            raise KinematicsError("a correction's box has no inside")
+            raise KinematicsError("the box of a correction is empty")
         nodes.setflags(write=False)
         object.__setattr__(self, "nodes", nodes)
 

@@ -74,7 +74,7 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
     if len(poses) < MIN_POSES:
         raise CalibrationError(
             f"{len(poses)} poses are too few for a map: at least {MIN_POSES} are required, "
-            "and about a hundred recommended"
+            "and about a hundred are recommended"
         )
     reached = _reached(geometry, room)
     for name, measured, within in zip(NAMES, poses.T, reached.T, strict=True):
@@ -82,13 +82,15 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
         spare = END_SHARE * (end - begin)
         if least > begin + spare or most < end - spare:
             raise CalibrationError(
-                f"{name} was measured from {least:.4g} to {most:.4g}, and the robot goes from {begin:.4g} to "
-                f"{end:.4g}: measure as far, or narrow limits.platform.{name}"
+                f"{name} was measured from {least:.4g} to {most:.4g}, but the robot moves from {begin:.4g} to "
+                f"{end:.4g}: measure the whole range, or narrow limits.platform.{name}"
             )
     try:
         wanted = forward(geometry, sliders, near=poses) - poses
     except KinematicsError as error:
-        raise CalibrationError(f"out of the geometry's reach, or the columns or units are wrong: {error}") from error
+        raise CalibrationError(
+            f"a pose is out of reach of the geometry, or the columns or units are wrong: {error}"
+        ) from error
     wanted[:, 2] -= 2.0 * math.pi * np.round(wanted[:, 2] / (2.0 * math.pi))
 
     shape = [n + DEGREE for n in cells]

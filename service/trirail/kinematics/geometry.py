@@ -59,7 +59,7 @@ class Geometry:
         _check(self)
         kind = self.each[0].KIND
         if self.kind not in ("", kind):
-            raise KinematicsError(f"kind is {self.kind!r}, and the legs are those of a {kind} robot")
+            raise KinematicsError(f"kind is {self.kind!r}, but the legs are those of a {kind} robot")
         object.__setattr__(self, "kind", kind)
         packed = np.stack([leg.packed() for leg in self.legs])
         if self.correction is not None:

@@ -164,9 +164,9 @@ def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoRet
     built, at, where = geometry.each[leg], worded(phi, "rad"), f"{place}leg {geometry.labels[leg]}"
     parallel = built.parallel_angle
     if parallel is None:
-        raise KinematicsError(f"{where}: out of all reach at phi = {at}", leg=LEGS[leg], value=phi)
+        raise KinematicsError(f"{where}: out of reach at phi = {at}", leg=LEGS[leg], value=phi)
     delta = math.remainder(phi - parallel, math.pi)
-    what = f"{built.CROSS} parallel to its rail" if abs(delta) <= 2.0 * PARALLEL else "out of all reach"
+    what = f"{built.CROSS} parallel to its rail" if abs(delta) <= 2.0 * PARALLEL else "out of reach"
     raise KinematicsError(
         f"{where}: {what} at phi = {at} (singular at {worded(phi - delta, 'rad')})",
         leg=LEGS[leg],

@@ -210,7 +210,7 @@ class Checker:
 
     def refusal(self, path: Path, time: float, pose: Sequence[float]) -> RefusedError:
         """Return the error that refuses a path that leaves the workspace at the time `time` along the path [s]."""
-        where = f"the path leads out of the workspace after {max(0.0, time) / path.duration:.0%} of its time"
+        where = f"the path leaves the workspace after {max(0.0, time) / path.duration:.0%} of its duration"
         rows = self._rows(path, time, pose)
         if rows is None:
             return RefusedError(RefusalCode.SINGULAR, f"{where}: the robot is singular there")

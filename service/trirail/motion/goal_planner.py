@@ -161,7 +161,8 @@ class GoalPlanner:
             slower = structs.replace(plan.reply, slowed=SLOWDOWN_STEP * plan.reply.slowed)
             plan = Plan(stretched(plan.path, SLOWDOWN_STEP), slower)
         raise RefusedError(
-            RefusalCode.NO_PLAN, "no motion follows at this override: send the goal again when it is lower"
+            RefusalCode.NO_PLAN,
+            "the goal cannot follow the current motion at this override: lower the override, then send the goal again",
         )
 
     def _plan_from_motion(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:

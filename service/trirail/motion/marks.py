@@ -65,7 +65,7 @@ def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[
     for number, mark in enumerate(marks):
         own = list(_switches(number, mark, trace))
         if len(rows) + len(own) > MAX_SWITCHES:
-            raise _refusal(number, mark, f"has {len(own):,} switches; a goal has {MAX_SWITCHES:,} at most")
+            raise _refusal(number, mark, f"has {len(own):,} switches; the maximum for a goal is {MAX_SWITCHES:,}")
         rows += own
         s = own[0][0]
         pose = trace.pose_at(s)
@@ -158,7 +158,7 @@ class _Trace:
         states = np.zeros((2, len(times), 3))
         for k in np.argsort(times, kind="stable"):  # each pose is on the branch of the previous pose
             if platform_at_law_time(self._legs, *self._path, law.knots, law.pieces, times[k], near, out):
-                raise RefusedError(RefusalCode.BAD_MARK, "the marks of a path through a singular pose have no place")
+                raise RefusedError(RefusalCode.BAD_MARK, "marks cannot be placed on a path through a singular pose")
             near[:] = out[0]
             states[:, k] = out[:2]
         return states[0], states[1]
@@ -228,7 +228,7 @@ def _switches(number: int, mark: Mark, trace: _Trace) -> Iterator[tuple[float, f
         return
     count = int((end - mark.start) / mark.increment * (1.0 + 1e-12)) + 1
     if count > MAX_SWITCHES:
-        raise _refusal(number, mark, f"has {count:,} pulses; a goal has {MAX_SWITCHES:,} at most")
+        raise _refusal(number, mark, f"has {count:,} pulses; the maximum for a goal is {MAX_SWITCHES:,}")
     for s in trace.times_at(begin + mark.increment * np.arange(count, dtype=np.float64)).tolist():
         yield s, width, number, int(mark.value)
 
@@ -261,14 +261,14 @@ def _time_of(number: int, mark: Mark, trace: _Trace) -> float:
     share = mark.at_path_fraction or 0.0
     if trace.length < LEAST_LENGTH:
         raise _refusal(
-            number, mark, "has a share of a path on which the tool does not travel: use after_start_s, or at"
+            number, mark, "has at_path_fraction, but the tool does not travel on the path: use after_start_s or at"
         )
     return float(trace.times_at(np.array([share * trace.length]))[0])
 
 
 def _check_length(number: int, mark: Mark, name: str, length: float, whole: float) -> None:
     if length > whole * (1.0 + 1e-9) + LEAST_LENGTH:
-        raise _refusal(number, mark, f"is at {name} = {length * 1e3:g} mm; the path has {whole * 1e3:g} mm")
+        raise _refusal(number, mark, f"is at {name} = {length * 1e3:g} mm; the path is {whole * 1e3:g} mm long")
 
 
 def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: float) -> None:
@@ -286,8 +286,8 @@ def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: fl
         if spacing[k] < needed[k]:
             number = int(own["mark"][k + 1])
             text = (
-                f"switches {spacing[k] * 1e3:.3g} ms after the switch before it; at full speed {needed[k] * 1e3:.3g} "
-                "ms is the least: lower the speed, or move the marks apart"
+                f"switches {spacing[k] * 1e3:.3g} ms after the previous switch; the minimum at full speed is "
+                f"{needed[k] * 1e3:.3g} ms: lower the speed, or move the marks apart"
             )
             raise _refusal(number, marks[number], text, float(spacing[k]), float(needed[k]))
 

@@ -81,7 +81,7 @@ class MotionPlanner:
 
     def _decide(self, request: PlanRequest) -> PlannedMotion | Extension:
         if request.revision != self._revision:
-            raise RefusedError(RefusalCode.INTERNAL, "the planner has another geometry or other limits than the loop")
+            raise RefusedError(RefusalCode.INTERNAL, "the planner and the loop have different geometries or limits")
         runs = deque(unpack_run(self._legs, run) for run in request.runs)
         if request.blend is not None and runs:
             return self._goals.append(request.goal, runs[-1], request.blend, request.lead)

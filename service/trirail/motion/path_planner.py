@@ -47,7 +47,8 @@ MAX_PATH_RATE = 2.0
 """Highest rate of the time along a path. It corresponds to an override of 200 %."""
 RATE_UNITS = "/s", "/s²", "/s³"
 TOO_FAST_IN_MOTION = RefusedError(
-    RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
+    RefusalCode.TOO_FAST,
+    "the robot cannot move from its present motion onto this path within the limits of its sliders",
 )
 
 
@@ -106,7 +107,7 @@ class PathPlanner:
             asked = _suggestion(violation.value, violation.limit, violation.unit)
             raise RefusedError(
                 RefusalCode.OUT_OF_WORKSPACE,
-                f"the goal is out of the workspace: {violation}{asked}",
+                f"the goal is outside the workspace: {violation}{asked}",
                 value=violation.value,
                 limit=violation.limit,
             )
@@ -277,8 +278,8 @@ class PathPlanner:
             raise RefusedError(
                 RefusalCode.TOO_FAST,
                 f"the trajectory is {slower:.3g} times too fast for {most_exceeded(worst)}: "
-                f"let it take {math.ceil(1e3 * path.duration) / 1e3:.10g} s, "
-                'or send it with "stretch": true, trirail follow --stretch',
+                f"let it last {math.ceil(1e3 * path.duration) / 1e3:.10g} s, "
+                'or send it with "stretch": true (trirail follow --stretch)',
                 value=slower,
                 limit=1.0,
             )
@@ -356,7 +357,9 @@ class PathPlanner:
             if factor_left <= 1.0:
                 return slow, factor
             factor *= factor_left * ROUNDING_FACTOR
-        raise RefusedError(RefusalCode.TOO_FAST, f"the path does not fit its limits even {factor:.3g} times slower")
+        raise RefusedError(
+            RefusalCode.TOO_FAST, f"the path exceeds its limits even when it is slowed {factor:.3g} times"
+        )
 
     def _can_hold(self, path: Path, ramp: float, brake: float, pose: Sequence[float]) -> bool:
         """Return whether a jog is within the limits during its part at constant velocity."""
@@ -383,9 +386,11 @@ class PathPlanner:
 def _jog_refusal(bound: str | None, result: SampleResult) -> RefusedError:
     """Return the error that refuses a jog because it would not move the robot."""
     if bound is not None:
-        text = f"the jog cannot move: it would pass the limit of {bound} before it could brake"
+        text = f"the jog cannot start: the robot would pass the limit of {bound} before it could brake"
         return RefusedError(RefusalCode.OUT_OF_WORKSPACE, text)
-    text = f"the jog is too fast for {most_exceeded(result.worst)}, however slow: choose a tool nearer to the platform"
+    text = (
+        f"the jog exceeds a limit of {most_exceeded(result.worst)} at any speed: choose a tool nearer to the platform"
+    )
     return RefusedError(RefusalCode.TOO_FAST, text)
 
 

@@ -16,7 +16,7 @@ from trirail.quantities import apart, worded
 
 MAX_START_OFFSET = 1e-4
 """Greatest allowed distance between the start of a trajectory and the robot's pose [m, rad]."""
-GO_THERE_HINT = "trirail follow --go-there or in Python follow(…, go_there=True)"
+GO_THERE_HINT = "trirail follow --go-there or, in Python, follow(…, go_there=True)"
 """Advice in messages about a robot that is not at the start of a trajectory."""
 REST_VELOCITY = 1e-6
 """Velocity below which the robot counts as being at rest at the ends of a trajectory [m/s, rad/s]."""
@@ -85,15 +85,17 @@ def check_ends(points: Sequence[Point], start: MotionState) -> None:
     An acceleration is allowed at both ends. Checker.sample takes it into account as the jerk of one cycle.
     """
     if not start.at_rest:
-        raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it is at rest")
+        raise RefusedError(
+            RefusalCode.WRONG_START, "the robot is moving: send the trajectory when the robot is at rest"
+        )
     for name, unit, begin, current in zip(COORDINATES, UNITS, points[0].pose, start.pose, strict=True):
         if abs(begin - current) > MAX_START_OFFSET:
-            text = "the trajectory begins at {} = {}, the robot is at {}: go there first, {}".format(
+            text = "the trajectory begins at {} = {}, but the robot is at {}: go to the first point, with {}".format(
                 name, *apart(begin, current, unit), GO_THERE_HINT
             )
             raise RefusedError(RefusalCode.WRONG_START, text, value=begin, limit=current)
     ends = (
-        (RefusalCode.WRONG_START, "begins", "let it begin at rest, as the robot stands", points[0]),
+        (RefusalCode.WRONG_START, "begins", "let it begin at rest, because the robot is at rest", points[0]),
         (RefusalCode.WRONG_END, "ends", "let it end at rest", points[-1]),
     )
     for code, does, remedy, point in ends:

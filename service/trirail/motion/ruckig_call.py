@@ -50,7 +50,8 @@ def solve_within(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory
         if try_solve(ruckig, request, trajectory):
             return
     raise RefusedError(
-        RefusalCode.NO_PLAN, "no motion leads there from the present one: send the goal again when the robot is at rest"
+        RefusalCode.NO_PLAN,
+        "no motion leads from the present motion to the goal: send the goal again when the robot is at rest",
     )
 
 

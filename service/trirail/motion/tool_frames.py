@@ -61,5 +61,5 @@ def rotated(x: float, y: float, angle: float) -> tuple[float, float]:
 
 def unknown_name(kind: str, name: str, known: Sequence[str]) -> RefusedError:
     """Return the error for an unknown tool or frame, with a list of the known names."""
-    there_are = f"there is {', '.join(known)}" if known else "there is none in [frames.tool]: give a point, [u, v]"
+    there_are = f"known are {', '.join(known)}" if known else "there are none in [frames.tool]: give a point, [u, v]"
     return RefusedError(RefusalCode.UNKNOWN_FRAME, f"no {kind} {name!r}: {there_are}")

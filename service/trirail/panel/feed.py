@@ -85,7 +85,7 @@ class Feed:
         See trirail.client.path_check.find_obstacle.
         """
         if self._pose is None:
-            return Obstacle("nobody knows where the robot is", code="unknown")
+            return Obstacle("the position of the robot is unknown", code="unknown")
         end = (goal.x, goal.y, goal.phi)
         return path_check.find_obstacle(self._robot_drawing, self._pose, end, goal.tool, goal.frame)
 

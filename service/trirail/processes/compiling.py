@@ -32,9 +32,9 @@ class Progress:
     def interrupted(self) -> str:
         """Message for a user who interrupts the start, which explains the consequence."""
         if not self._begun:
-            return "the start is interrupted, nothing has moved"
+            return "the start was interrupted; nothing has moved"
         place = len(self._begun)
-        return f"compiling is interrupted at function {place}: those before it are kept, the next start continues there"
+        return f"compilation was interrupted at function {place}: the next start continues from there"
 
     def begin(self, name: str) -> None:
         """Report that a function is being compiled. The next report must follow within `patience` seconds."""
@@ -45,7 +45,10 @@ class Progress:
         now = len(self._begun)
         words = f"{now} of {FUNCTIONS} functions"
         if not before:
-            self._say(f"the first start compiles the mathematics, {FUNCTIONS} functions; once, half a minute or more")
+            self._say(
+                f"the first start compiles {FUNCTIONS} functions, which takes half a minute or more; later starts do "
+                "not"
+            )
         elif now * QUARTERS // FUNCTIONS > before * QUARTERS // FUNCTIONS:
             self._say(f"compiling: {words}")
         notify(f"STATUS=compiling, once: {words}\nEXTEND_TIMEOUT_USEC={self._patience * 1e6:.0f}")

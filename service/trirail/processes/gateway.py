@@ -365,8 +365,8 @@ ROUTES: dict[str, Route] = {
     "info": Route((), lambda gateway, _: gateway._info),
     "role": Route(("user",), Gateway._user_role),
     "poses": Route((), lambda gateway, _: gateway._poses.table()),
-    "teach": Route(("user", "pose"), Gateway._edit_poses, NoContent | None, "teach takes no content"),
-    "forget": Route(("user", "pose"), Gateway._edit_poses, NoContent | None, "forget takes no content"),
+    "teach": Route(("user", "pose"), Gateway._edit_poses, NoContent | None, "teach accepts no content"),
+    "forget": Route(("user", "pose"), Gateway._edit_poses, NoContent | None, "forget accepts no content"),
     "alignment": Route(("user",), Gateway._forward_look, AlignmentLook, "not a look of an alignment"),
 }
 """Routes of all keys that clients query, by the kind of message."""

@@ -178,7 +178,7 @@ class Inbox:
         if _stops(large):
             name = large.key.rpartition("/")[2]
             if self._has_kept(large.unanswered()):
-                error = ErrorReply(error.code, f"{error.message}; {name} takes effect nevertheless")
+                error = ErrorReply(error.code, f"{error.message}; {name} is carried out nevertheless")
             else:
                 error = ErrorReply(RefusalCode.BUSY, TOO_MUCH)
         self._refuse(large, error)

@@ -196,9 +196,11 @@ class Backlog:
         """Raise RefusedError if there is no space for another goal of this size [bytes]."""
         own = self._goals.count(user)
         if own >= GOALS_OF_ONE:
-            raise RefusedError(RefusalCode.BUSY, f"{own} goals of {user} are waiting already: send fewer")
+            raise RefusedError(
+                RefusalCode.BUSY, f"{own} goals of {user} are already waiting, which is the maximum: send fewer goals"
+            )
         if len(self._goals) >= GOALS or self._bytes + size > MAX_UNREAD:
-            raise RefusedError(RefusalCode.BUSY, f"{len(self._goals)} goals are waiting already: send fewer")
+            raise RefusedError(RefusalCode.BUSY, f"too many goals are waiting ({len(self._goals)}): send fewer goals")
 
     def add(self, incoming: Incoming, request: GoalRequest) -> None:
         """Enqueue a goal after the user's other goals.
@@ -218,8 +220,8 @@ class Backlog:
         """
         incoming, request = self._goals.first(user)
         if request.withdrawn is None and time.monotonic_ns() - request.received_ns > GOAL_PATIENCE * 1e9:
-            waited = f"it has waited longer than {GOAL_PATIENCE:g} s"
-            reason = f"{waited}, for goals before it or a busy machine: send it again"
+            waited = f"the goal waited longer than {GOAL_PATIENCE:g} s"
+            reason = f"{waited} for earlier goals or because the machine was busy: send the goal again"
             request = structs.replace(request, withdrawn=reason)
         return WaitingGoal(incoming, request)
 

@@ -229,7 +229,7 @@ class MetricsServer:
     def _answer(self, environ: Mapping[str, Any], start: _Start) -> Iterable[bytes]:
         """Answer an HTTP request. This method is a WSGI application."""
         if self._tls is not None and environ[USER] not in self._users:
-            return _respond(start, HTTPStatus.FORBIDDEN, {"error": f"{environ[USER] or 'nobody'} has no role"})
+            return _respond(start, HTTPStatus.FORBIDDEN, {"error": f"{environ[USER] or 'this client'} has no role"})
         match environ["PATH_INFO"]:
             case "/metrics":
                 return self._metrics(environ, start)  # type: ignore[no-any-return]
@@ -241,7 +241,7 @@ class MetricsServer:
                 service = self._health.service
                 warnings = service.warnings if service is not None else ()
                 return _respond(start, status, {"ok": fit, "processes": processes, "warnings": warnings})
-        return _respond(start, HTTPStatus.NOT_FOUND, {"error": "there are /metrics and /healthz"})
+        return _respond(start, HTTPStatus.NOT_FOUND, {"error": "unknown path: use /metrics or /healthz"})
 
 
 USER: Final = "trirail.user"

@@ -84,11 +84,11 @@ class GatewayLink:
         if self._port.clear_lost():
             self.frozen = False
             self._in_hand.clear()
-            return coded("the gateway is gone: controlled stop", EventCode.GATEWAY_LOST)
+            return coded("the gateway has died: controlled stop", EventCode.GATEWAY_LOST)
         if self._watch.silent():
             if not self.frozen:
                 self.frozen = True
-                words = f"the gateway is frozen, no sign of life for {self._timeout:g} s: controlled stop"
+                words = f"the gateway is frozen, without a sign of life for {self._timeout:g} s: controlled stop"
                 return coded(words, EventCode.GATEWAY_FROZEN, timeout=self._timeout)
         elif self._watch.has_beat:
             self.frozen = False
@@ -111,9 +111,9 @@ class PlannerLink:
     def request_plan(self, request: PlanRequest) -> None:
         """Send a request to the planner. If that fails, `answers` reports the failure in the next cycle."""
         if not self._port.connected:
-            self._unsent = "the planner is not running, it is being restarted"
+            self._unsent = "the planner is not running and is being restarted"
         elif not self._port.send(encode(request)):
-            self._unsent = "the planner accepts no request, its queue is full"
+            self._unsent = "the queue of requests to the planner is full"
         else:
             self._awaited = request.number
 

@@ -70,7 +70,9 @@ class PoseFile:
             raise ServiceError(f"{error}; this file holds the taught poses") from error
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             problem = str(error).replace("`", "")
-            raise ServiceError(f"{self.path}: {problem}; mend it, or move it away and teach the poses again") from error
+            raise ServiceError(
+                f"{self.path}: {problem}; repair the file, or move it away and teach the poses again"
+            ) from error
 
     def set_aside(self) -> Path:
         """Rename the file to an unused name and return the new path. Raises OSError if that fails."""

@@ -107,10 +107,12 @@ class Poses:
         both = sorted(self._taught.keys() & self._configured.keys())
         foreign = sorted(name for name in self._taught.keys() - both if self._is_foreign(self._taught[name]))
         other = (
-            f"taught with another [geometry]: {', '.join(foreign)}; check each: trirail goto NAME, trirail teach NAME"
+            f"poses taught with another [geometry]: {', '.join(foreign)}; check each with trirail goto NAME, then "
+            "repeat trirail teach NAME"
         )
         return *filter(None, (self._lacking, self._gone, other if foreign else "")), *(
-            f"pose {name} is that of [poses]; the taught one is not used: trirail forget {name}" for name in both
+            f"pose {name} is defined in [poses], and the taught pose is not used: remove it with trirail forget {name}"
+            for name in both
         )
 
     def _is_foreign(self, pose: TaughtPose) -> bool:
@@ -136,7 +138,7 @@ class Poses:
         except ServiceError as error:
             if not again:
                 raise
-            self._lacking = f"{error}; there are no taught poses now"
+            self._lacking = f"{error}; no taught poses are available now"
             with contextlib.suppress(OSError):  # if the file cannot be renamed, changes of poses will be refused
                 self._lacking += f"; the file is kept as {self._file.set_aside()}"
             return {}
@@ -144,10 +146,10 @@ class Poses:
     def _lost_warning(self) -> str:
         """Return the text of the warning that the file has been deleted."""
         if not self._taught:
-            return f"{self._file.path} has gone: taught poses, if there were any, are lost"
+            return f"{self._file.path} no longer exists: any taught poses in the file are lost"
         known = ", ".join(sorted(self._taught))
         return (
-            f"{self._file.path} has gone: taught poses are known only until the service ends ({known}); "
+            f"{self._file.path} no longer exists: taught poses ({known}) are kept only until the service ends; "
             "the next trirail teach or forget writes them again"
         )
 
@@ -171,7 +173,10 @@ class Poses:
     def edit(self, incoming: Incoming, user: str, name: str) -> None:
         """Handle a query on …/teach or …/forget. Raises RefusedError if the query is invalid."""
         if self._under_way >= MAX_CHANGES_UNDER_WAY:
-            raise RefusedError(RefusalCode.BUSY, f"{self._under_way} poses are being taught already: send fewer")
+            raise RefusedError(
+                RefusalCode.BUSY,
+                f"{self._under_way} poses are already being taught or removed, which is the maximum: send fewer",
+            )
         if incoming.kind == "forget":
             self._check_known(name)
             self._write(_Change(incoming, user, name, None))
@@ -180,10 +185,12 @@ class Poses:
         if name in self._configured:
             raise RefusedError(
                 RefusalCode.CONFIGURED_POSE,
-                f"{name} is defined in [poses]: teach another name, or change it in that section",
+                f"pose {name} is defined in [poses]: use another name, or change the pose in that section",
             )
         if len(self._taught) >= MAX_TAUGHT_POSES and name not in self._taught:
-            raise RefusedError(RefusalCode.BUSY, f"{MAX_TAUGHT_POSES} poses are kept already: remove one")
+            raise RefusedError(
+                RefusalCode.BUSY, f"the maximum of {MAX_TAUGHT_POSES} taught poses is reached: remove one first"
+            )
         self._under_way += 1
         self._to_measure.append(_Change(incoming, user, name, None))
 
@@ -207,7 +214,7 @@ class Poses:
             self._under_way -= 1
             pose = change.pose or self._taught.get(change.name)
             if failure is not None or pose is None:  # None if two clients have removed the pose at the same time
-                why = f"{change.name} is as it was: {failure or 'it has been removed already'}"
+                why = f"pose {change.name} is unchanged: {failure or 'another client has removed it'}"
                 self._refuse(change.incoming, RefusedError(RefusalCode.FAILED, why))
                 continue
             if change.pose is not None:
@@ -232,10 +239,10 @@ class Poses:
         check_new_pose(name)
         if name in self._configured:
             raise RefusedError(
-                RefusalCode.CONFIGURED_POSE, f"{name} is defined in [poses]: remove it from that section"
+                RefusalCode.CONFIGURED_POSE, f"pose {name} is defined in [poses]: remove it from that section"
             )
         there_are = ", ".join(sorted(self._taught)) or "none"
-        raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r} was taught: there is {there_are}")
+        raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r} has been taught; taught poses: {there_are}")
 
     def _measured(self, record: np.void) -> Coordinates:
         """Return the measured pose. Raises RefusedError if the robot is in fault or moves, or its pose is unknown."""

@@ -205,7 +205,7 @@ class Reports:
         packet = self._recorder.receive()
         if self._recorder.clear_lost() and self._recorded:
             self._recorded = False
-            self._unrecorded = "the recorder has gone: nothing is recorded until it is back"
+            self._unrecorded = "the recorder has died: nothing is recorded until it has restarted"
             lost = coded(self._unrecorded, EventCode.RECORDER_LOST)
             self._control.ledger.notices.append(Notice("service", "warning", lost.text, **lost.fields))
             self._publish_status()

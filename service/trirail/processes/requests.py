@@ -138,7 +138,7 @@ class Requests:
         if not name.stops:
             self._check_command_count(user)
         if isinstance(content, AcquireLease) and content.force:
-            self._guard.check(user, self._takeover, "taking the lease over")
+            self._guard.check(user, self._takeover, "taking over the lease")
         self._tickets += 1
         request = CommandRequest(self._tickets, user, name, content)
         with self._urgent_section() if name.stops else nullcontext():
@@ -154,7 +154,7 @@ class Requests:
     def _send(self, incoming: Incoming, request: CommandRequest | CheckRequest, within: float) -> None:
         """Send a request to the loop, with a time-out `within` [s]. Raises RefusedError if the loop's queue is full."""
         if not self._link.send(message(request)):
-            raise RefusedError(RefusalCode.BUSY, "too many requests: send it again")
+            raise RefusedError(RefusalCode.BUSY, "the queue of requests to the loop is full: send the request again")
         self._commands[request.ticket] = request.user
         self._pending[request.ticket] = _PendingRequest(incoming, time.monotonic() + within)
 
@@ -162,9 +162,13 @@ class Requests:
         """Raise RefusedError if too many commands and checks are in progress, either for this user or overall."""
         own, all_ = sum(sender == user for sender in self._commands.values()), len(self._commands)
         if own >= MAX_COMMANDS_OF_USER:
-            raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
+            raise RefusedError(
+                RefusalCode.BUSY, f"{own} commands of {user} are already in progress, which is the maximum: send fewer"
+            )
         if all_ >= MAX_COMMANDS:
-            raise RefusedError(RefusalCode.BUSY, f"{all_} commands are under way already: send fewer")
+            raise RefusedError(
+                RefusalCode.BUSY, f"{all_} commands are already in progress, which is the maximum: send fewer"
+            )
 
     # ------------------------------------------------------------------ answers
 
@@ -181,7 +185,7 @@ class Requests:
         """Answer requests that the loop has not answered in time with a time-out error."""
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._pending.items() if waiting.deadline < now]:
-            self.answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "not carried out in time"))
+            self.answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "the request was not carried out in time"))
 
 
 class CommandReader:
@@ -208,7 +212,7 @@ class CommandReader:
         try:
             name = Command(command)
         except ValueError as error:
-            problem = f"{quoted(command)}: no such command; there are {', '.join(Command)}"
+            problem = f"unknown command {quoted(command)}: use one of {', '.join(Command)}"
             raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
         fresh = self._replies.without_copies(incoming) if name in STOPS else incoming
         if fresh is None:
@@ -220,13 +224,13 @@ class CommandReader:
 
     def _read(self, incoming: Incoming, user: str, name: Command) -> None:
         try:
-            content = incoming.content(name.accepts, f"{name} takes {name.content.words}")
+            content = incoming.content(name.accepts, f"{name} accepts {name.content.words}")
         except RefusedError as refusal:
             if name not in STOPS:
                 raise
             # The sender of a malformed stop wants to stop the robot. Carry the stop out as if it had no content.
             self._carry_out(incoming.unanswered(), user, name, None)
-            raise RefusedError(refusal.code, f"{refusal}; {name} takes effect nevertheless") from refusal
+            raise RefusedError(refusal.code, f"{refusal}; {name} is carried out nevertheless") from refusal
         self._carry_out(incoming, user, name, content)
 
     def refused(self, ticket: int, error: ErrorReply) -> CommandReply | ErrorReply:
@@ -278,10 +282,10 @@ class Looks:
         look = structs.replace(received, words=quoted(received.words))
         now = self._clock()
         if self._pace.wait(user, now) > 0.0:
-            raise RefusedError(RefusalCode.BUSY, f"more than {LOOKS_PER_SECOND:g} looks per second: send fewer")
+            raise RefusedError(RefusalCode.BUSY, f"more than {LOOKS_PER_SECOND:g} looks per second: report fewer looks")
         self._pace.count(user, now)
         level: Level = "info" if look.end in SUCCESSFUL_ENDS else "warning"
         text = alignment_event_text(look, in_words(look))
         if not self._announce(Notice("alignment", level, text.text, user=user, alignment=look, **text.fields)):
-            raise RefusedError(RefusalCode.BUSY, "the loop accepts no more requests at the moment: send it again")
+            raise RefusedError(RefusalCode.BUSY, "the queue of messages to the loop is full: send the look again")
         return look

@@ -21,8 +21,8 @@ from trirail.wire.stop_protocol import StopRequest, command_of, stop_address
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Role
 
-_NO_DOOR = "no door for stops at"
-_DOOR_REMEDY = "a flood of the other ports then keeps new stops out; free that port, or change zenoh.listen"
+_NO_DOOR = "no stop port at"
+_DOOR_REMEDY = "when other ports are flooded, new stops cannot get through; free this port, or change zenoh.listen"
 
 
 class Guard:
@@ -48,8 +48,10 @@ class Guard:
             self._credentials = admission.credentials.in_memory()
             if self._connect and self._credentials.name != self._robot:
                 raise ServiceError(
-                    f"{folder}: the certificate of {self._credentials.name}, and a router takes robot {self._robot} "
-                    f"by its name alone: trirail keys robot {self._robot} makes its own"
+                    f"{folder}: the certificate has the name {self._credentials.name}, but a router accepts robot "
+                    f"{self._robot} "
+                    f"only with a certificate of the name {self._robot}: create one with trirail keys robot "
+                    f"{self._robot}"
                 )
             self.users = admission.users
             self._gone = [user for user in config.zenoh.users if user not in self.users]
@@ -71,7 +73,10 @@ class Guard:
         def ask(shown: str, request: StopRequest, answer: Answer) -> None:
             user, command = command_of(request, self._robot)
             if self._credentials is not None and user != shown:
-                raise RefusedError(RefusalCode.NOT_ALLOWED, f"{quoted(shown) or 'nobody'} cannot send as {user}")
+                raise RefusedError(
+                    RefusalCode.NOT_ALLOWED,
+                    f"the certificate of {quoted(shown) or 'no user'} cannot be used to send as {user}",
+                )
             self.check(user, command.role, command)
             take(request, answer)
 
@@ -79,7 +84,7 @@ class Guard:
         door, self._without_door = StopDoor(secured, ask), []
         for address in filter(None, map(stop_address, self._listen)):
             if not isinstance(address.where, str) and any(same_port(address.where, at) for at in self._others):
-                self._without_door.append(f"{_NO_DOOR} {address}, where [telemetry] listens: {_DOOR_REMEDY}")
+                self._without_door.append(f"{_NO_DOOR} {address}, which [telemetry] uses: {_DOOR_REMEDY}")
                 continue
             try:
                 door.listen(address)
@@ -128,13 +133,13 @@ class Guard:
         role = self.role(user)
         if role is None or not role.includes(needed):
             state = f"is {role}" if role is not None else "has no role"
-            problem = f"{user} {state} at {self._robot}: {action} needs {needed}"
+            problem = f"{user} {state} at robot {self._robot}: {action} needs the role {needed}"
             raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings about insecure endpoints, the stop port and certificates, as lines that state the remedy."""
         insecure = [
-            f"insecure: everyone who reaches {endpoint} can move the robot; trirail keys init makes certificates"
+            f"insecure: anyone who can reach {endpoint} can move the robot; make certificates with trirail keys init"
             for endpoint in (*self._listen, *self._connect)
             if reach(endpoint) is ReachableBy.NETWORK
         ]

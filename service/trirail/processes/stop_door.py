@@ -248,7 +248,7 @@ class StopDoor:
         try:
             request = decoded(line, StopRequest)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            return ErrorReply(RefusalCode.MALFORMED, quoted(f"not a stop: {error}"))
+            return ErrorReply(RefusalCode.MALFORMED, quoted(f"not a valid stop request: {error}"))
         self._enter(caller, _Stage.WAITING, user or str(request.key.split("/")[3:4]))
         answered: asyncio.Future[CommandReply | ErrorReply] = self._loop.create_future()
 

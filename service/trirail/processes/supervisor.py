@@ -42,8 +42,8 @@ PORTS = ("gateway", "recorder", "planner")
 WATCHED_BY_SYSTEMD = ("loop", "gateway")
 """Essential processes, without whose heartbeats systemd ends the service. It survives the loss of other processes."""
 CONSEQUENCES = {
-    "gateway": "the loop stops the robot and holds",
-    "planner": "the motion under way continues, new goals are refused",
+    "gateway": "the loop stops the robot and holds its position",
+    "planner": "the motion in progress continues, and new goals are refused",
     "recorder": "the robot is not affected",
     "drives": "the robot is in fault; restart the service to restart them",
 }
@@ -204,7 +204,7 @@ class Supervisor:
                 release_startup_memory()
             elif time.monotonic() - max(began, self._progress_at) > START_WITHIN:
                 missing = ", ".join(name for name in self._names if name not in ready)
-                raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
+                raise ServiceError(f"the service did not start within {START_WITHIN:g} s; still starting: {missing}")
 
     def _kill_hung(self) -> None:
         """Check all processes once per CHECK_PERIOD_S, and kill hung processes. `_on_end` then handles their end."""
@@ -246,12 +246,14 @@ class Supervisor:
         if name == "loop":
             self._loop_has_run = child.ready_message is not None
             if child.returncode == 0:
-                consequence = "it has stopped the robot and disabled the drives"
+                consequence = "the loop has stopped the robot and disabled the drives"
             elif self._loop_has_run:
                 consequence = "the drives stop by their own watchdogs"
             else:
-                consequence = "it had not begun"
-            self._fail("" if said_why else f"the loop is dead ({child.end_description}): {consequence}; ending")
+                consequence = "the loop had not started"
+            self._fail(
+                "" if said_why else f"the loop has died ({child.end_description}): {consequence}; the service ends"
+            )
             return
         if child.ready_message is None and not restarts:
             self._fail("" if said_why else f"the {name} could not start ({child.end_description})")
@@ -264,11 +266,12 @@ class Supervisor:
         restarts[:] = [moment for moment in restarts if now - moment < 60.0] + [now]
         wait = 0.0 if len(restarts) <= RESTARTS else RETRY_PAUSE_S
         if wait and name == "gateway":
-            self._fail(f"the gateway keeps dying ({child.end_description}): ending the service")
+            self._fail(f"the gateway has died repeatedly ({child.end_description}): the service ends")
             return
         when = f" in {wait:g} s" if wait else ""
         self._report(
-            f"the {name} has died ({child.end_description}): {CONSEQUENCES[name]}; starting it again{when}", "warning"
+            f"the {name} has died ({child.end_description}): {CONSEQUENCES[name]}; restarting it{when}",
+            "warning",
         )
         if name == "recorder":
             self._record = None  # do not overwrite the first recording
@@ -298,9 +301,10 @@ class Supervisor:
         if self._parent.gone and not self._ending:
             loop = self._children.get("loop")
             turns = loop is not None and loop.ready_message is not None
-            consequence = "the loop stops the robot and disables the drives" if turns else "the loop had not begun"
+            consequence = "the loop stops the robot and disables the drives" if turns else "the loop had not started"
             self._fail(
-                f"the process that forks the others has died ({self._parent.describe_end()}): {consequence}; ending"
+                f"the process that starts the others has died ({self._parent.describe_end()}): {consequence}; the "
+                "service ends"
             )
 
     def _pass_on(self, child: ChildProcess) -> None:
@@ -375,10 +379,11 @@ def _runtime_folder() -> Iterator[Path]:
         try:
             folder = stack.enter_context(files.temporary_folder(parent))
         except OSError as error:
-            where = f"{parent}, the XDG_RUNTIME_DIR" if parent else "any folder for temporary files"
+            where = f"{parent} (XDG_RUNTIME_DIR)" if parent else "any folder for temporary files"
             raise ServiceError(
                 f"cannot make a folder for sockets in {where}: {error.strerror}; "
-                f"{'unset that, or ' if parent else ''}set {'it' if parent else 'TMPDIR'} to a folder of this user"
+                f"{'unset XDG_RUNTIME_DIR, or ' if parent else ''}set {'it' if parent else 'TMPDIR'} to a folder of "
+                "this user"
             ) from error
         yield folder
 

@@ -100,8 +100,8 @@ class TrajectoryParts:
             if goal.due < now:
                 del self._incomplete[key]
                 text = (
-                    f"trajectory {quoted(key[1])}: {goal.missing} did not come within {PARTS_WITHIN:g} s: "
-                    "send the goal again, all of its parts one after the other"
+                    f"trajectory {quoted(key[1])}: {goal.missing} not received within {PARTS_WITHIN:g} s: "
+                    "send all parts of the goal again, one after the other"
                 )
                 self._refuse(goal.message, RefusedError(RefusalCode.EXPIRED, text))
 
@@ -112,13 +112,16 @@ def _check(incomplete: _Incomplete, goal: TrajectoryGoal, number: int, of: int) 
     points = sum(len(part.goal.rows) // ROW for part in incomplete.received.values()) + len(goal.points)
     first = next(iter(incomplete.received.values()), None)
     if of != incomplete.of:
-        problem = f"is of {of}, the others are of {incomplete.of}"
+        problem = f"states a total of {of} parts, the other parts state {incomplete.of}"
     elif number in incomplete.received:
-        problem = "has come already"
+        problem = "has already been received"
     elif first is not None and _options(first.goal) != _options(goal):
-        problem = "has other options than those before it: stretch, settle and valid_for are the same in all"
+        problem = "has other options than the earlier parts: give all parts the same stretch, settle and valid_for"
     elif points > MAX_POINTS:
-        problem = f"makes {points} points: at most {MAX_POINTS} are taken; take fewer, since paths are quintic between"
+        problem = (
+            f"makes {points} points in total, the maximum is {MAX_POINTS}: send fewer, since paths between points are "
+            "quintic"
+        )
     if problem:
         text = f"trajectory {quoted(goal.id or '')}: part {number} {problem}"
         raise RefusedError(RefusalCode.MALFORMED, text)

@@ -138,7 +138,10 @@ class LinkMonitor:
         count = unopened.total()
         by = ", ".join(f"{number} from {host}" for host, number in unopened.most_common(1))
         wait = count / FAILED_A_SECOND
-        words = f"{count} connections to the gateway open no session ({by}): a new one waits {wait:.0f} s, no stop does"
+        words = (
+            f"{count} connections to the gateway have not opened a session ({by}): new ones wait {wait:.0f} s; stops "
+            "do not"
+        )
         text = coded(words, EventCode.CONNECTIONS_WAIT, count=count, wait=wait)
         self._warn(count >= UNOPENED * self._hysteresis(text.code), text)
 
@@ -146,7 +149,8 @@ class LinkMonitor:
         """Set or clear the warning that a resource is nearly used up."""
         code = EventCode.SESSIONS_FULL if what == "sessions" else EventCode.DESCRIPTORS_FULL
         words = (
-            f"{used} of {most} {what} of the gateway are in use{by}: beyond that, new clients can only stop the robot"
+            f"{used} of {most} {what} of the gateway are in use{by}: when all are in use, new clients can only stop "
+            "the robot"
         )
         self._warn(used >= most * WARNING_SHARE * self._hysteresis(code), coded(words, code, used=used, most=most))
 
@@ -247,8 +251,10 @@ class RouterLinks:
         error = router.asked.exception()  # not raised, because an error with an unknown peer must not end the service
         why = quoted(f"{error!r}") if error is not None else router.asked.result()
         router.asked = None
-        why = why or "it answers, but opens no session: is it a router that takes this robot?"
-        router.warning = f"no link to the router {router.endpoint}: {why}; it is dialled again, local control continues"
+        why = why or "the router answers, but opens no session: check that it is a router for this robot"
+        router.warning = (
+            f"no link to the router {router.endpoint}: {why}; the connection is retried, and local control continues"
+        )
         if router.linked is not False:
             router.linked = False
             text = coded(router.warning, EventCode.ROUTER_LOST, router=router.endpoint)

@@ -43,7 +43,7 @@ class CandumpLog:
             try:
                 self._recreate()
             except OSError as error:
-                return f"{self._path} has been deleted or moved, and cannot be created again: {error.strerror}"
+                return f"{self._path} was deleted or moved, and cannot be created again: {error.strerror}"
         if full := disk_shortage(self._path.parent, RESERVE):
             return full
         lines = "".join(
@@ -76,7 +76,7 @@ class CandumpLog:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._begin("xb")  # a new file of this name belongs to another process: do not overwrite it
         deleted.close()
-        words = f"{self._path} has been deleted or moved; created again"
+        words = f"{self._path} was deleted or moved, and has been created again"
         self._warn(coded(words, EventCode.CAPTURE_MOVED, file=str(self._path)))
 
 

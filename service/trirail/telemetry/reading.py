@@ -94,7 +94,9 @@ def read(path: str | os.PathLike[str]) -> Recording:
     texts = _static(chunks, _DOCUMENT)
     kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
     if SOFTWARE in texts and not kept:
-        raise EmptyRecordingError(f"{path}: nothing was recorded: its service ended before the first cycle reached it")
+        raise EmptyRecordingError(
+            f"{path}: the recording is empty, because the service ended before the first cycle was recorded"
+        )
     records, t, wall = _cycles([chunk.to_record_batch() for chunk in kept], path)
     return Recording(
         name=next(iter(_static(chunks, "RecordingInfo:name").values()), ""),
@@ -151,7 +153,9 @@ def _without_partial_message(path: Path, *, growing: bool = False) -> Iterator[P
             copy = Path(shutil.copyfile(path, f"{folder}/{path.name}"))
             os.truncate(copy, length)
         except OSError as error:
-            raise ServiceError(f"{path} was cut off, and cannot be copied to {folder}: {error.strerror}") from error
+            raise ServiceError(
+                f"{path} is incomplete, and cannot be copied to {folder} for reading: {error.strerror}"
+            ) from error
         yield copy
 
 
@@ -179,7 +183,7 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
             warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)  # the file was cut off
             reader = RrdReader(whole)
         if not reader.recordings():
-            raise ServiceError(f"{path}: holds no recording")
+            raise ServiceError(f"{path}: contains no recording")
         return [chunk for chunk in reader.stream() if chunk.is_static or chunk.entity_path in _READ_ENTITIES]
     except (RuntimeError, ValueError) as error:
         raise ServiceError(f"{path}: cannot be read as a recording: {error}") from error
@@ -193,7 +197,9 @@ def _cycles(
     Errors and warnings are the same as for `read`.
     """
     if not any(batch.num_rows for batch in batches):
-        raise ServiceError(f"{path}: holds no records of cycles (entity {RECORD}): was it made by trirail?")
+        raise ServiceError(
+            f"{path}: contains no records of cycles (entity {RECORD}); check that trirail made this file"
+        )
     parts = [batch.column(FIELDS.component).flatten() for batch in batches]
     for kind in {part.type for part in parts}:
         _check_layout(kind, path)

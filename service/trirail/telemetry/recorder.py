@@ -256,7 +256,10 @@ class Recorder:
         except FileNotFoundError:  # the recording was deleted
             retention.sidecar(recording).unlink(missing_ok=True)
         except OSError as error:
-            words = f"{retention.sidecar(recording)} cannot be written, trirail sessions reads the recording: {error}"
+            words = (
+                f"{retention.sidecar(recording)} cannot be written, so trirail sessions reads the recording itself: "
+                f"{error}"
+            )
             if words != self._sidecar_error:
                 self._warn(coded(words, EventCode.NOT_INDEXED, error=str(error)))
         self._sidecar_error = words
@@ -302,7 +305,7 @@ class Recorder:
             self._reported_trouble = problem
         elif self._reported_trouble and t >= self._recovered_at:
             self._reported_trouble = ""
-            self._warn(coded(f"recorded again; {self._missing_text()}", EventCode.RECORDED_AGAIN))
+            self._warn(coded(f"recording resumed; {self._missing_text()}", EventCode.RECORDED_AGAIN))
         return bool(self._reported_trouble)
 
     def _rotate(self) -> None:
@@ -318,7 +321,10 @@ class Recorder:
             deleted = retention.tidy(folder, at_most, self._first.stem)
             if deleted:
                 names = ", ".join(path.name for path in deleted)
-                words = f"deleted, since all recordings take more than telemetry.keep_mb = {at_most / MB:g}: {names}"
+                words = (
+                    f"old recordings deleted, because all recordings exceed telemetry.keep_mb = {at_most / MB:g}: "
+                    f"{names}"
+                )
                 self._warn(coded(words, EventCode.RECORDINGS_DELETED, keep_mb=at_most / MB, files=names))
         except OSError as error:
             words = f"cannot delete old recordings: {error}"

@@ -137,10 +137,10 @@ class Recording(NamedTuple):
         if not len(rows):
             words = {"of goal": goal and quoted(goal), "from": begin, "to": end}
             asked = " ".join(f"{word} {value}" for word, value in words.items() if value is not None)
-            raise ServiceError(f"{self.name}: no cycles {asked}: it has those from {t[0]:.3f} to {t[-1]:.3f} s")
+            raise ServiceError(f"{self.name}: no cycles {asked}: the recording covers {t[0]:.3f} to {t[-1]:.3f} s")
         if every is not None:
             if not every > 0.0:
-                raise ServiceError(f"a row every {every:g} s: not positive; expected a time such as 10ms")
+                raise ServiceError(f"the interval of the rows, {every:g} s, must be positive: use a time such as 10ms")
             number = np.floor((t[rows] - t[rows[0]]) / every + _ROUNDING)
             rows = rows[np.concatenate([[True], np.diff(number) > 0])]
         first, last = t[rows[0]], t[rows[-1]]
@@ -181,7 +181,7 @@ class Recording(NamedTuple):
             try:
                 seconds = pd.Timedelta(every).total_seconds() if isinstance(every, str) else every
             except ValueError as error:
-                words = f"a row every {quoted(str(every))}: not a time; expected one such as 10ms"
+                words = f"the interval of the rows, {quoted(str(every))}, is not a time: use a time such as 10ms"
                 raise ServiceError(words) from error
             recording = self.part(every=seconds)
         made: pd.DataFrame = table(recording, columns).to_pandas().set_index("t")
@@ -219,7 +219,11 @@ def chosen(columns: Sequence[str]) -> tuple[str, ...]:
         if not matches:
             words = dict.fromkeys(word for name in everything for word in (name, *name.split("_")))
             close = difflib.get_close_matches(column, words, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"expected one of, or a word in: {', '.join(everything)}"
+            hint = (
+                f"did you mean {close[0]}?"
+                if close
+                else f"use one of these names, or a word of one: {', '.join(everything)}"
+            )
             raise ServiceError(f"no column {quoted(column)}: {hint}")
         fields += matches
     return tuple(dict.fromkeys(fields)) if columns else everything
@@ -244,8 +248,8 @@ def _goal(recording: Recording, goal: str) -> tuple[int, float]:
     }
     ended = {line.event.id: line.t for line in recording.events if line.event is not None and line.event.kind == "goal"}
     if goal not in taken_at:
-        last = ", ".join(list(taken_at)[:5]) or "none at all"
-        raise ServiceError(f"{recording.name}: no goal {quoted(goal)} in it; the newest: {last}")
+        last = ", ".join(list(taken_at)[:5]) or "none"
+        raise ServiceError(f"{recording.name}: the recording has no goal {quoted(goal)}; its newest goals: {last}")
     return taken_at[goal], ended.get(goal, np.inf)
 
 

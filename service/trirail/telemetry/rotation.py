@@ -89,7 +89,7 @@ class RotatedFiles:
         if self._archive.gone and (self._retry is None or now >= self._retry):
             self._retry, deleted = now + RETRY, self.path
             if self.turn():
-                words = f"{deleted} has been deleted or moved; the recording continues in {self.path}"
+                words = f"{deleted} was deleted or moved; the recording continues in {self.path}"
                 self._warn(coded(words, EventCode.RECORDING_MOVED, file=str(deleted), next=str(self.path)))
         self._archive.write_chunks(chunks)
         self.cause = self.trouble or self.cause

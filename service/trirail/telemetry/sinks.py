@@ -94,7 +94,7 @@ class Archive:
     def _write(self, chunks: list[Chunk]) -> str:
         """Write a batch; return the reason for a failure, or "" on success."""
         if self.gone:
-            return f"{self._path} has been deleted or moved, and no other file can be created there"
+            return f"{self._path} was deleted or moved, and no other file can be created there"
         if full := disk_shortage(self._directory, self._reserve):
             return full
         if not self._stuck or self._flushed(0.01):

@@ -99,8 +99,9 @@ class Credentials(NamedTuple):
         credentials = cls.read(folder)
         if not credentials.serves:
             raise ServiceError(
-                f"{folder / CERTIFICATE}: the certificate of user {credentials.name}, with which nobody serves others: "
-                "trirail keys init or trirail keys robot makes one for a robot or router"
+                f"{folder / CERTIFICATE}: the certificate of user {credentials.name} is not valid for a robot or "
+                "router: "
+                "create one with trirail keys init or trirail keys robot"
             )
         return credentials
 

@@ -20,12 +20,17 @@ class EventCode(StrEnum):
     ARRIVED = "arrived", "the goal has reached its end"
     SETTLED = "settled", "the robot is in position", "settle"
     NOT_IN_POSITION = "not_in_position", "the robot did not settle in time", "timeout"
-    STANDSTILL = "standstill", "the robot stands"
+    STANDSTILL = "standstill", "the robot is at rest"
     RELEASED = "released", "a jog or track was not renewed and has stopped"
     NOT_RENEWED = "not_renewed", "a jog or track was not renewed in time", "goal", "user"
     PASSED = "passed", "the robot passed the goal's end on its way to the next goal", "goal"
-    PREEMPTED = "preempted", "another goal has replaced it", "goal"
-    EARLIER_GOAL_ENDED = "earlier_goal_ended", "a goal that it was to follow has ended", "goal", "outcome"
+    PREEMPTED = "preempted", "another goal has replaced the goal", "goal"
+    EARLIER_GOAL_ENDED = (
+        "earlier_goal_ended",
+        "an earlier goal, which the goal was to follow, has ended",
+        "goal",
+        "outcome",
+    )
     TOO_LATE = "too_late", "the goal waited longer than its valid_for"
     STOPPED_AT_LIMIT = "stopped_at_limit", "a jog has stopped at a limit"
     BEYOND_LIMIT = "beyond_limit", "a track's target is beyond a limit", "goal"
@@ -43,7 +48,7 @@ class EventCode(StrEnum):
 
     # The lease.
     LEASE_ACQUIRED = "lease_acquired", "a user has acquired the lease", "user"
-    LEASE_TAKEN_OVER = "lease_taken_over", "a user has taken the lease from another", "user", "before"
+    LEASE_TAKEN_OVER = "lease_taken_over", "a user has taken the lease from another user", "user", "before"
     LEASE_RELEASED = "lease_released", "a user has released the lease", "user"
     LEASE_EXPIRED = "lease_expired", "the lease's holder gave no sign of life", "user", "timeout"
 
@@ -64,8 +69,8 @@ class EventCode(StrEnum):
     # Drives.
     DRIVE_WARNING = "drive_warning", "a warning of the drives or their bus", "warning"
     DRIVE_NOT_READY = "drive_not_ready", "a drive must be configured again", "drive", "reason"
-    DRIVE_READY = "drive_ready", "a drive is configured, others are not", "drive"
-    DRIVES_READY = "drives_ready", "a drive is configured, as all are now", "drive"
+    DRIVE_READY = "drive_ready", "a drive is configured, but others are not", "drive"
+    DRIVES_READY = "drives_ready", "a drive is configured, and so are all others", "drive"
     POSITION_UNKNOWN = "position_unknown", "a slider must be homed again", "slider"
     SLIDER_MOVED = "slider_moved", "a slider moved while its drive was off", "slider", "position_before", "position"
 

@@ -31,7 +31,7 @@ class Crossing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=Tr
 
     def __post_init__(self) -> None:
         if sum(value is not None for value in (self.x, self.y, self.phi)) != 1:
-            raise ValueError("at takes one coordinate: x, y or phi")
+            raise ValueError("at accepts exactly one coordinate: x, y or phi")
 
     @property
     def coordinate(self) -> tuple[int, float]:
@@ -84,11 +84,11 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
         if self.start is None and (self.end is not None or self.increment is not None):
             raise ValueError(f"a mark of {self.output!r} has an end or increment without a start")
         if self.increment is not None and self.pulse_width is None:
-            raise ValueError(f"a repetition of {self.output!r} needs a pulse_width beside its increment")
+            raise ValueError(f"a repetition of {self.output!r} has an increment, and needs a pulse_width too")
         if self.start is not None and self.increment is None and self.pulse_width is not None:
-            raise ValueError(f"a mark of {self.output!r} has a start and a pulse_width: it needs an increment too")
+            raise ValueError(f"a mark of {self.output!r} has a start and a pulse_width, and needs an increment too")
         if self.start is not None and self.end is not None and self.end <= self.start:
-            raise ValueError(f"a repetition of {self.output!r} ends at {self.end:g} m: behind its start is right")
+            raise ValueError(f"a repetition of {self.output!r} ends at {self.end:g} m: its end must be after its start")
 
     @property
     def closes(self) -> bool:

@@ -85,7 +85,7 @@ def command_of(request: StopRequest, robot: str) -> tuple[str, Command]:
     if name not in STOPS:
         raise RefusedError(
             RefusalCode.UNKNOWN_COMMAND,
-            f"the stop port accepts only {', '.join(sorted(STOPS))}; send others over Zenoh",
+            f"the stop port accepts only {', '.join(sorted(STOPS))}; send other commands over Zenoh",
         )
     return user, Command(name)
 

@@ -20,9 +20,9 @@ _QUANTITY = re.compile(r"-?[0-9]+([eE]-?[0-9]+)?(m|cm|mm|um|nm|in|rad|mrad|urad|
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 """Pattern of decimal numbers. Python's float would also accept underscores and digits of other scripts."""
 
-NAME_RULE = f"letters, digits, - and _, at most {MAX_NAME}"
+NAME_RULE = f"at most {MAX_NAME} letters, digits, - and _"
 QUANTITY_RULE = "reads as a number or a quantity; choose a name such as p5mm"
-ID_RULE = f"at most {MAX_NAME} characters, none of them for control or formatting"
+ID_RULE = f"at most {MAX_NAME} characters, without control and formatting characters"
 
 
 _WITH_COMMA = re.compile(r"\s*[-+]?[0-9]+,[0-9]+(?![0-9,.])")

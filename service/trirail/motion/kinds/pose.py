@@ -27,7 +27,7 @@ class PoseMotion(GoalMotion[PoseGoal]):
         if goal.frame == PLATFORM:
             raise RefusedError(
                 RefusalCode.UNKNOWN_FRAME,
-                "frame platform: a pose in the platform's own frame is not defined; send a move in that frame",
+                "frame platform: a pose cannot be given in the platform's own frame; send a move in that frame",
             )
         x0, y0, turned = frames.frame(goal.frame)
         dx, dy = rotated(goal.x, goal.y, turned)

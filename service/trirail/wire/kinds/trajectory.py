@@ -103,12 +103,13 @@ def check_times(times: Sequence[float]) -> None:
     duration = times[-1] - times[0] if times else 0.0
     if duration > MAX_DURATION_S:
         raise ValueError(
-            f"points: they last {duration:g} s, a trajectory {MAX_DURATION_S:g} s at most; are times in seconds?"
+            f"points: the trajectory lasts {duration:g} s, the maximum is {MAX_DURATION_S:g} s; check that times are "
+            "in seconds"
         )
     for before, after in itertools.pairwise(times):
         if not after - before > 0.999 * SHORTEST_PIECE:  # tolerate rounding of the last digit
             raise ValueError(
-                f"points: t = {after} follows t = {before}: times must rise, by {SHORTEST_PIECE:g} s at least"
+                f"points: t = {after} follows t = {before}: times must rise by at least {SHORTEST_PIECE:g} s"
             )
 
 
