@@ -66,7 +66,7 @@ BOUNDS = (
     Bound("Active commands, of one user and of all", ("trirail.processes.requests:MAX_COMMANDS_OF_USER commands",
           "trirail.processes.requests:MAX_COMMANDS commands"), "refused, `busy`, except stops"),
     Bound("Zenoh sessions", ("trirail.wire.zenoh_session:SESSIONS sessions",), "not opened"),
-    Bound("Connections to the port for stops", ("trirail.processes.stop_door:MAX_CALLERS connections",),
+    Bound("Connections to the port for stops", ("trirail.processes.stop_port:MAX_CALLERS connections",),
           "the oldest of the address, or of the user, is closed"),
     Bound("Wait of a goal for those before it", ("trirail.processes.incoming:GOAL_PATIENCE s",),
           "refused, `stopped`; a goal may have its own, `valid_for`: `expired`"),

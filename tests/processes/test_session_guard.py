@@ -306,7 +306,7 @@ def test_a_gateway_that_is_started_again_has_the_certificates_and_roles_of_the_s
     guard = Guard(config, admission)
     assert guard.users == admission.users
     assert "gone" not in guard.users
-    with guard.open() as opened, contextlib.closing(guard.stop_door(lambda *_: None)):
+    with guard.open() as opened, contextlib.closing(guard.stop_port(lambda *_: None)):
         opened.declare_queryable("trirail/demo/role/ann", lambda query: query.reply("trirail/demo/role/ann", b"here"))
         with zenoh_session.open_client(config.zenoh.listen[0], Credentials.read(user(tmp_path, "ann"))) as ann:
             (reply,) = ann.get("trirail/demo/role/ann", timeout=WITHIN)

@@ -63,7 +63,7 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         cycles = f"a service's loop, process {running}, runs on processor {cpu}"
     if not measures and before is not None:
         time.sleep(COUNTING_S)
-    door = guard(config)
+    checked = guard(config)
     return Machine(
         release=platform.release(),
         preempt_rt=_text(SYSTEM / "kernel/realtime") == "1" or "PREEMPT_RT" in platform.version(),
@@ -79,12 +79,12 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         traffic=traffic_between(before, read_counters(channel)),
         coalescing=read_coalescing(channel) if channel else None,
         adapter=adapters.missing_support(config.can.interface),
-        guard=door,
+        guard=checked,
         issued=issued(config),
         limited_ports=limited_ports() if config.zenoh.tls is not None else None,
         routers=()
-        if isinstance(door, str)
-        else tuple((each, door.why_not_linked(each)) for each in config.zenoh.connect),
+        if isinstance(checked, str)
+        else tuple((each, checked.why_not_linked(each)) for each in config.zenoh.connect),
     )
 
 

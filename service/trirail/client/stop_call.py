@@ -32,7 +32,7 @@ AGAIN_AFTER: Final = 0.05
 Outcome = CommandReply | TrirailError
 
 
-class NoDoorError(ServiceError):
+class StopPortError(ServiceError):
     """Error raised if a stop gets no reply from the stop port."""
 
 
@@ -93,7 +93,7 @@ class Outcomes:
         self._errors.append(outcome)
         if len(self._errors) < self._copies:
             return None
-        raise min(self._errors, key=lambda error: (isinstance(error, NoDoorError), isinstance(error, ServiceError)))
+        raise min(self._errors, key=lambda error: (isinstance(error, StopPortError), isinstance(error, ServiceError)))
 
 
 class StopCall:
@@ -113,7 +113,7 @@ class StopCall:
         self._deadline = time.monotonic() + within
         self._deliver = deliver
         self._cancelled = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="stop at the door", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="stop at the port", daemon=True)
         self._thread.start()
 
     def join(self) -> None:
@@ -130,12 +130,12 @@ class StopCall:
         except TrirailError as error:
             self._deliver(error)
         except Exception as error:  # noqa: BLE001 - the caller must get an outcome in any case
-            self._deliver(NoDoorError(f"cannot send a stop to {self._address}: {error!r}"))
+            self._deliver(StopPortError(f"cannot send a stop to {self._address}: {error!r}"))
 
     def _query_until_answered(self) -> CommandReply:
         """Send the request repeatedly until a reply arrives; return the reply.
 
-        Raises RefusedError if the service refuses, and NoDoorError if no reply arrives in time.
+        Raises RefusedError if the service refuses, and StopPortError if no reply arrives in time.
         """
         secured = tls.client(self._credentials) if self._address.secured and self._credentials is not None else None
         why: OSError | None = None
@@ -151,9 +151,9 @@ class StopCall:
             ) as error:
                 why = error  # the port has closed the connection without a reply
             except OSError as error:
-                raise NoDoorError(f"no stop port answers at {self._address}: {error}") from error
+                raise StopPortError(f"no stop port answers at {self._address}: {error}") from error
             self._cancelled.wait(AGAIN_AFTER)
-        raise NoDoorError(f"no answer from the stop port {self._address}: {why}")
+        raise StopPortError(f"no answer from the stop port {self._address}: {why}")
 
     def _try(self, secured: ssl.SSLContext | None, left: float) -> CommandReply:
         with contextlib.ExitStack() as opened:
@@ -188,15 +188,15 @@ def _connect(address: StopAddress, within: float) -> socket.socket:
 def _read(line: bytes) -> CommandReply:
     """Return the reply in a line from the stop port.
 
-    Raises RefusedError if the service refuses, and NoDoorError if the line is invalid or is from another robot.
+    Raises RefusedError if the service refuses, and StopPortError if the line is invalid or is from another robot.
     """
     try:
         answer = decoded(line, StopAnswer)
     except (msgspec.MsgspecError, ValueError) as error:
-        raise NoDoorError(f"the program at the stop port is not a service of trirail: {error}") from error
+        raise StopPortError(f"the program at the stop port is not a service of trirail: {error}") from error
     if answer.reply is not None:
         return answer.reply
     no = answer.error or ErrorReply(RefusalCode.INTERNAL, "an empty answer")
     if no.code is RefusalCode.UNKNOWN_KEY:
-        raise NoDoorError(f"the stop port belongs to another robot: {no.message}")
+        raise StopPortError(f"the stop port belongs to another robot: {no.message}")
     raise RefusedError(no.code, no.message, slider=no.slider, value=no.value, limit=no.limit)

@@ -126,7 +126,7 @@ class Gateway:
 
     def serve(self, ready: Callable[[], None]) -> None:
         """Serve clients until `end` is called or the loop disconnects. Call `ready` after the loop's welcome."""
-        door = self._guard.stop_door(self._inbox.stop_at_door)
+        stop_port = self._guard.stop_port(self._inbox.stop_at_port)
         poll = select.poll()
         poll.register(self._link.fileno(), select.POLLIN)
         poll.register(self._inbox.fileno(), select.POLLIN)
@@ -160,7 +160,7 @@ class Gateway:
             self._routers.close()
             for incoming in (*self._requests, *self._parts):
                 self._replies.answer(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
-            door.close()
+            stop_port.close()
             self._replies.close()
 
     def warnings(self) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ import zenoh
 from trirail.errors import RefusalCode
 from trirail.processes.incoming import FairQueue, Incoming, Pace
 from trirail.processes.memory_budget import OVERHEAD, Budget
-from trirail.processes.stop_door import Answer
+from trirail.processes.stop_port import Answer
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import ErrorReply
 from trirail.wire.sizes import MAX_BESIDE, MAX_MESSAGE, MAX_NAME, MAX_UNREAD, MAX_UNREAD_OF_ONE
@@ -154,7 +154,7 @@ class Inbox:
         others = (_wait(self._others_pace, user, now) for user in self._readable())
         return min((*stops, *others), default=math.inf)
 
-    def stop_at_door(self, request: StopRequest, answer: Answer) -> None:
+    def stop_at_port(self, request: StopRequest, answer: Answer) -> None:
         """Enqueue a request from the stop port. This method may be called from any thread."""
         content = request.content.encode()
         stop = Incoming("cmd", request.key, len(content), content, "", None, time.monotonic_ns(), at_door=answer)

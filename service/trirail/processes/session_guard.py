@@ -11,7 +11,7 @@ import zenoh
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes.sockets import SOCKET_MODE, connections, disconnect
-from trirail.processes.stop_door import Answer, StopDoor
+from trirail.processes.stop_port import Answer, StopPort
 from trirail.wire import tls, zenoh_session
 from trirail.wire.access import access_control
 from trirail.wire.credentials import Admission, Credentials
@@ -21,8 +21,8 @@ from trirail.wire.stop_protocol import StopRequest, command_of, stop_address
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Role
 
-_NO_DOOR = "no stop port at"
-_DOOR_REMEDY = "when other ports are flooded, new stops cannot get through; free this port, or change zenoh.listen"
+_NO_STOP_PORT = "no stop port at"
+_REMEDY = "when other ports are flooded, new stops cannot get through; free this port, or change zenoh.listen"
 
 
 class Guard:
@@ -41,7 +41,7 @@ class Guard:
         self._gone: list[str] = []
         telemetry = config.telemetry
         self._others = (("127.0.0.1", telemetry.live_port), (telemetry.metrics_address, telemetry.metrics_port))
-        self._without_door: list[str] = []
+        self._without_stop_port: list[str] = []
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
             admission = admission or Admission.read(folder, config.zenoh.users)
@@ -67,7 +67,7 @@ class Guard:
             path.chmod(SOCKET_MODE)
         return opened
 
-    def stop_door(self, take: Callable[[StopRequest, Answer], None]) -> StopDoor:
+    def stop_port(self, take: Callable[[StopRequest, Answer], None]) -> StopPort:
         """Open a stop port for each endpoint. `warnings` lists the endpoints for which that failed."""
 
         def ask(shown: str, request: StopRequest, answer: Answer) -> None:
@@ -81,19 +81,19 @@ class Guard:
             take(request, answer)
 
         secured = None if self._credentials is None else tls.server(self._credentials)
-        door, self._without_door = StopDoor(secured, ask), []
+        port, self._without_stop_port = StopPort(secured, ask), []
         for address in filter(None, map(stop_address, self._listen)):
             if not isinstance(address.where, str) and any(same_port(address.where, at) for at in self._others):
-                self._without_door.append(f"{_NO_DOOR} {address}, which [telemetry] uses: {_DOOR_REMEDY}")
+                self._without_stop_port.append(f"{_NO_STOP_PORT} {address}, which [telemetry] uses: {_REMEDY}")
                 continue
             try:
-                door.listen(address)
+                port.listen(address)
             except OSError as error:
-                self._without_door.append(
-                    f"{_NO_DOOR} {address} ({(error.strerror or str(error)).lower()}): {_DOOR_REMEDY}"
+                self._without_stop_port.append(
+                    f"{_NO_STOP_PORT} {address} ({(error.strerror or str(error)).lower()}): {_REMEDY}"
                 )
-        door.start()
-        return door
+        port.start()
+        return port
 
     def links(self, opened: zenoh.Session) -> dict[str, str | None]:
         """Return the name in the certificate of each link, by address; None for a link without a certificate."""
@@ -143,7 +143,7 @@ class Guard:
             for endpoint in (*self._listen, *self._connect)
             if reach(endpoint) is ReachableBy.NETWORK
         ]
-        return (*insecure, *self._without_door, *self.certificate_warnings())
+        return (*insecure, *self._without_stop_port, *self.certificate_warnings())
 
     def certificate_warnings(self) -> tuple[str, ...]:
         """Return warnings about a certificate that expires soon, and about revoked users in the configuration."""

@@ -75,8 +75,8 @@ def stop_address(endpoint: str) -> StopAddress | None:
     if address is None or endpoint.startswith("ws/"):
         return None
     host, port = address
-    door = port + PORT_OFFSET if port + PORT_OFFSET <= LAST_PORT else port - PORT_OFFSET
-    return StopAddress((host, door), secured=reach(endpoint) is ReachableBy.CERTIFICATE)
+    stop_port = port + PORT_OFFSET if port + PORT_OFFSET <= LAST_PORT else port - PORT_OFFSET
+    return StopAddress((host, stop_port), secured=reach(endpoint) is ReachableBy.CERTIFICATE)
 
 
 def command_of(request: StopRequest, robot: str) -> tuple[str, Command]:

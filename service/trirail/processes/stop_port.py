@@ -78,7 +78,7 @@ class _Caller:
         self.readable = asyncio.Event()
 
 
-class StopDoor:
+class StopPort:
     """Server of the stop port. `start` begins to serve requests, and `close` ends the server."""
 
     def __init__(self, secured: ssl.SSLContext | None, handle_request: RequestHandler) -> None:
@@ -91,7 +91,7 @@ class StopDoor:
         self._reserve = Reserve(self._max_callers)
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name="stop door", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="stop port", daemon=True)
 
     def listen(self, address: StopAddress) -> None:
         """Listen on an address. Call this method before `start`. Raises OSError if that is impossible."""

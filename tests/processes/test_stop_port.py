@@ -14,13 +14,13 @@ import msgspec
 import pytest
 from certificates import service_port, tls_config, user
 from control_rig import CONFIG
-from trirail.client.stop_call import NoDoorError, Outcome, StopCall, StopOrder
+from trirail.client.stop_call import Outcome, StopCall, StopOrder, StopPortError
 from trirail.config import Config, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.processes import stop_door
+from trirail.processes import stop_port
 from trirail.processes.session_guard import Guard
 from trirail.processes.sockets import Reserve
-from trirail.processes.stop_door import Answer
+from trirail.processes.stop_port import Answer
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
@@ -49,7 +49,7 @@ class Asked:
 
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_door, "MAX_CALLERS", PLACES)
+    monkeypatch.setattr(stop_port, "MAX_CALLERS", PLACES)
 
 
 Opened = tuple[str, Asked]
@@ -58,7 +58,7 @@ Does = Callable[[socket.socket, int], None]
 
 def opened(config: Config) -> Iterator[Opened]:
     asked = Asked()
-    door = Guard(config).stop_door(asked)
+    door = Guard(config).stop_port(asked)
     try:
         yield config.zenoh.listen[0], asked
     finally:
@@ -126,7 +126,7 @@ def test_nothing_else_is_taken_there(plain: Opened, name: str) -> None:
 
 def test_another_robots_door_is_none(plain: Opened) -> None:
     locator, asked = plain
-    assert isinstance(call(locator, robot="other"), NoDoorError)
+    assert isinstance(call(locator, robot="other"), StopPortError)
     assert asked.requests == []
 
 
@@ -301,11 +301,11 @@ def test_an_address_that_is_taken_is_told_with_the_remedy_and_the_service_goes_o
     assert not isinstance(address.where, str)
     guard = Guard(config)
     with socket.create_server(address.where):
-        door = guard.stop_door(lambda *_: None)
+        door = guard.stop_port(lambda *_: None)
         assert any(f"no stop port at {address}" in warning for warning in guard.warnings())
         door.close()
-    guard.stop_door(lambda *_: None).close()
-    assert not any("no door" in warning for warning in guard.warnings())
+    guard.stop_port(lambda *_: None).close()
+    assert not any("no stop port" in warning for warning in guard.warnings())
 
 
 def test_a_port_that_the_configuration_needs_for_more_is_not_taken() -> None:
@@ -314,7 +314,7 @@ def test_a_port_that_the_configuration_needs_for_more_is_not_taken() -> None:
     address = door_of(listen[0])
     telemetry = msgspec.structs.replace(CONFIG.telemetry, live_port=int(address.where[1]))
     guard = Guard(msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=listen), telemetry=telemetry))
-    door = guard.stop_door(lambda *_: None)
+    door = guard.stop_port(lambda *_: None)
     assert any("which [telemetry] uses" in warning for warning in guard.warnings())
     door.close()
 
