@@ -21,6 +21,7 @@ HELD = {
     "SYNC": "every SYNC is a tick of the period: none too early, none in a burst, none but the missed ones lacking",
     "setpoints": "one per drive and SYNC, within the limits, without a step in position, velocity or acceleration",
     "power": "controlwords and states in CiA 402's order, each state asked for, no power without a setpoint",
+    "order": "SDO requests follow the setpoints of their cycle, except controlwords that stop a drive",
     "capture": "the service's own log has the same frames in the same order",
 }
 """Properties that are proved if `problems` and `differences` find nothing."""
@@ -90,7 +91,7 @@ def read(path: Path) -> list[Frame]:
 def problems(log: Sequence[Frame], config: Config, missed: int, until: float) -> list[str]:
     """Return the errors in the frames before the time `until`, one line each; `missed` ticks were reported missing."""
     log = [frame for frame in log if frame.t < until]
-    lines = sync_problems(log, config.period, missed, until)
+    lines = [*sync_problems(log, config.period, missed, until), *order_problems(log)]
     for name, drive in zip(NAMES, config.drives.each, strict=True):
         lines += (f"drive {name}: {problem}" for problem in _setpoint_problems(log, drive, config))
         lines += (f"drive {name}: {problem}" for problem in _power_problems(log, drive.node))
@@ -160,6 +161,23 @@ def _sync_problems(syncs: Sequence[float], period: float, missed: int) -> Iterat
     # A tick may be late by nearly a period at either end.
     if abs(lacking - missed) > 2:
         yield f"SYNC: {lacking} of {ticks} ticks have none, but the service says that it missed {missed}"
+
+
+def order_problems(log: Sequence[Frame]) -> Iterator[str]:
+    """Yield the SDO requests that are sent between a SYNC and a setpoint of its cycle.
+
+    A frame between them would delay the setpoint. After the setpoints, a request has most of the period for its way.
+    """
+    request: Frame | None = None
+    for frame in log:
+        service = frame.identifier & ~0x7F
+        if frame.identifier == layout.SYNC:
+            request = None
+        elif service == layout.SDO_REQUEST and not frame.data.startswith(layout.CONTROLWORD_DOWNLOAD):
+            request = request or frame
+        elif service == layout.RPDO2 and request is not None:
+            yield f"SDO request {request.data.hex()} precedes a setpoint of its cycle, at {request.t:.6f}"
+            request = None
 
 
 def _setpoints(log: Sequence[Frame], drive: Drive) -> list[Setpoint]:

@@ -7,10 +7,12 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import bus_log
 import pytest
 from trirail import RefusedError, Robot
 from trirail.client import own_service
 from trirail.wire.vocabulary import Mode
+from trirail_drivers.cia402 import canopen_frames as layout
 from waiting import wait_until
 
 VIRTUAL_DRIVES = Path(__file__).parents[2] / "tools/virtual_drives.py"
@@ -26,6 +28,8 @@ def drives(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Pat
     bus = tmp_path / "bus"
     text = config.read_text()
     text = text.replace('interface = "simulated" ', f'interface = "unix"\nchannel = "{bus}" ')
+    text = text.replace("live_port = 0", "live_port = 0\ncapture_can = true")
+    assert "capture_can" in text
     if request.param == "odrive":
         text = text.replace('protocol = "cia402"', 'protocol = "odrive"').replace("counts_per_metre = 1e7", TURNS)
     config.write_text(text)
@@ -84,6 +88,14 @@ def test_a_service_recovers_without_a_restart(drives: tuple[Path, str, Tell], tm
         assert robot.state().faults == ()
         robot.enable()
         move(robot, 0.0)
+        tell("B reboot for 1")
+        wait_until(lambda: robot.state().mode == Mode.FAULT)
+        reset_once_configured(robot)
+    (captured,) = tmp_path.glob("*.log")
+    log = bus_log.read(captured)
+    requests = [frame for frame in log if frame.identifier & ~0x7F == layout.SDO_REQUEST]
+    assert requests or "odrive" in config.read_text()
+    assert list(bus_log.order_problems(log)) == []
 
 
 @pytest.mark.long

@@ -142,3 +142,16 @@ def test_a_frame_that_the_service_did_not_send_is_noticed() -> None:
 def test_the_format_is_candumps(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("(1.500000) can1 080#\n(1.500100) can1 301#0102030405060708\n")
     assert bus_log.read(tmp_path / "log") == [Frame(1.5, 0x080, b""), Frame(1.5001, 0x301, bytes(range(1, 9)))]
+
+
+@pytest.mark.parametrize(
+    ("data", "noticed"),
+    [(layout.STATUSWORD_UPLOAD, True), (layout.CONTROLWORD_DOWNLOAD + bytes(4), False)],
+)
+def test_a_request_before_a_setpoint_of_its_cycle_is_noticed(data: bytes, noticed: bool) -> None:
+    """A controlword that stops a drive may come first."""
+    at = next(number for number, frame in enumerate(GOOD) if moving(frame))
+    request = Frame(GOOD[at].t, layout.SDO_REQUEST + 2, data)
+    assert any("precedes a setpoint" in line for line in problems([*GOOD[:at], request, *GOOD[at:]])) == noticed
+    end = next(number for number, frame in enumerate(GOOD[at:], at) if frame.identifier == layout.SYNC)
+    assert not any("precedes" in line for line in problems([*GOOD[:end], request, *GOOD[end:]]))
