@@ -377,7 +377,7 @@ def test_what_is_in_the_way_is_said_before_anything_moves(enabled: Page) -> None
 def test_what_is_no_number_is_said_and_goes_nowhere(word: str, enabled: Page, robot: FakeRobot) -> None:
     before = robot.pose
     typed(enabled, "1", word, "0")
-    assert "a number was expected" in enabled.text("#going-says")
+    assert "expected a number" in enabled.text("#going-says")
     enabled.until_equal("document.querySelector('#to-y').getAttribute('aria-invalid')", "true")
     enabled.click("#go")
     enabled.until_equal("document.activeElement.id", "to-y")
@@ -462,7 +462,7 @@ def test_the_numbers_and_the_drawing_are_the_state(page: Page, robot: FakeRobot)
 def test_a_service_that_is_silent_is_told_and_comes_back(page: Page, robot: FakeRobot) -> None:
     robot.silent.set()
     page.until("document.querySelector('#mode-name').textContent === 'no contact'")
-    assert "old" in page.text("#alarm")
+    assert "out of date" in page.text("#alarm")
     assert "mm" not in page.text("#pose")
     moving = (
         "['.platform', '.sleeve', '.carriage', '.pivot']"

@@ -201,7 +201,7 @@ def test_one_that_is_too_fast_is_refused_or_slowed_where_that_is_wanted(page: Pa
     page.until("document.querySelector('#follow').disabled")
     page.click("#stretch")
     may(page, "yes")
-    assert "times slower than asked for" in page.text("#file-says")
+    assert "times slower than requested" in page.text("#file-says")
 
 
 def test_a_file_is_slowed_and_followed_by_keys_alone(page: Page, robot: FakeRobot) -> None:
@@ -319,7 +319,7 @@ def test_where_there_is_nothing_here_that_is_said(page: Page, robot: FakeRobot, 
     deadline = time.monotonic() + 60.0
     while "the disk is full" not in sessions(page):
         assert time.monotonic() < deadline
-    assert "not of the panel's" in sessions(page)
+    assert "not on the panel's" in sessions(page)
 
 
 @given(st.text())
