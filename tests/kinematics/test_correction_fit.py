@@ -89,7 +89,7 @@ def test_what_makes_no_map_is_said_in_a_line(tmp_path: Path, capsys: pytest.Capt
     assert re.search(
         r"x was measured from -0\.0\d+ to 0\.0\d+, but the robot moves from", said(poses[inside], sliders[inside])
     )
-    assert "out of reach of the geometry" in said(poses, sliders * 10.0)
+    assert "cannot be reached with the configured geometry" in said(poses, sliders * 10.0)
     wild = np.random.default_rng(2).normal(0.0, 3e-3, poses.shape)
     assert re.search("too steep near x|expected float", said(poses + wild * [1.0, 1.0, 5.0], sliders))
 

@@ -31,8 +31,7 @@ class LentFrames(FrameIO, Protocol):
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
         """Take back `number` received frames from compiled code, which has handled only the first `handled` frames.
 
-        `receive` returns the remaining frames, and then raises `error` (errno.h), which is 0 if receiving has not
-        failed.
+        `receive` returns the remaining frames, and then raises `error` (errno.h) unless `error` is 0.
         """
 
 
@@ -78,7 +77,7 @@ class FrameCalls:
         self._frames.set_identifiers(identifiers)
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:  # noqa: ARG002 - frames and error are kept here
-        """Take frames back: `receive` returns the frames of the last receiving call except the first `handled`."""
+        """Take back the frames of the last receiving call; `receive` returns all except the first `handled` frames."""
         self._returned.extend(self._last_received[handled:number])
 
     def _receive_all(self, address: int, most: int) -> int:

@@ -145,7 +145,10 @@ class SocketFrames:
         return BusAccess(self._socket.fileno())
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take frames back: `receive` returns all except the first `handled`, and then raises `error` (errno.h)."""
+        """Take back frames from compiled code, which has handled only the first `handled` frames.
+
+        `receive` returns the remaining frames, and then raises `error` (errno.h) unless `error` is 0.
+        """
         self._returned.extend(arrived.unpacked(handled, number))
         self._error = error
 

@@ -413,9 +413,10 @@ class Cia402Axis(Axis):
         return now - self.stands_since >= STANDSTILL_TIME_S and self.missed == 0
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return a fault if the drive still has power `seconds` [s] after the command `wanted`, such as "disable".
+        """Return a fault if the drive still has power some time after a command such as "disable".
 
-        Return None for a drive in fault or not operational, since it already has another fault.
+        `seconds` is the time since the command [s], and `wanted` is the name of the command. Return None for a drive
+        in fault or not operational, because another fault already reports that drive.
         """
         if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
             return None

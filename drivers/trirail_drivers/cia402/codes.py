@@ -164,7 +164,10 @@ _DEFAULT_REMEDY = "see the drive's manual"
 
 
 def describe_error(code: int, also: str = "") -> str:
-    """Describe an error code [0, FFFFh]: a hexadecimal number with its meaning, the text `also`, and a remedy."""
+    """Describe an error code [0, FFFFh]: the hexadecimal code, its meaning and a remedy.
+
+    `also` is text to insert after the meaning.
+    """
     meaning = _CODES.get(code) or _by_class(_CLASSES, code) or _UNKNOWN_CLASS
     remedy = _REMEDIES.get(code) or _by_class(_REMEDIES, code) or _DEFAULT_REMEDY
     return f"0x{code:04X} ({meaning}){also}; {remedy}"

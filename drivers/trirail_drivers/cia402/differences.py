@@ -132,7 +132,10 @@ class Differences:
             self.notes.append(text)
 
     def refusal(self, accepted: Sequence[str]) -> str:
-        """Return the error message for missing protections that are not `accepted`, or ""; note the accepted ones."""
+        """Return an error message with the missing protections that the user has not `accepted`; "" if there are none.
+
+        For each accepted protection that is missing, add a note.
+        """
         refused, notes = review_protections(self.remote.name, self.missing_protections, accepted, PROTECTIONS)
         for text in notes:
             self.add_note(text)

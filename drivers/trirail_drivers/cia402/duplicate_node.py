@@ -49,7 +49,10 @@ class AnswersAfterStop:
         return self._fault is None
 
     def begin(self, fault: DriveFault | None) -> None:
-        """Begin to count positions; `fault` is the fault that was attributed to the node."""
+        """Begin to count the positions that arrive with the node's identifier.
+
+        `fault` is the fault to return if the positions prove that there is a second node; None counts nothing.
+        """
         if self._fault is None:
             self._fault, self._answers = fault, 0
 
@@ -58,8 +61,9 @@ class AnswersAfterStop:
         self._fault = None
 
     def end_cycle(self, *, came: bool) -> DriveFault | None:
-        """End a cycle, in which a position arrived if `came`. Once the positions prove that there is another node,
-        return the fault that was attributed to this node, otherwise None.
+        """Count a position if `came` says that one arrived in this cycle.
+
+        Return the fault given to `begin` once ANSWERS_AFTER positions prove that there is another node, otherwise None.
         """
         fault = self._fault
         if fault is None:

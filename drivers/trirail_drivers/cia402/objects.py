@@ -123,7 +123,7 @@ def signed(key: Key) -> bool:
 
 
 def find_use(key: Key) -> tuple[str, ObjectUse] | None:
-    """Return an object's name in USES, and its use; None if the driver does not use it."""
+    """Return the key of an object in the table USES, and its entry; None if the driver does not use the object."""
     index, subindex = key
     if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
         index &= 0xFE00
@@ -134,7 +134,7 @@ def find_use(key: Key) -> tuple[str, ObjectUse] | None:
 
 
 def describe_protection(protection: str) -> str:
-    """Return a protection's purpose and the consequence of lacking it, for people."""
+    """Return text for people with the purpose of a protection, and the consequence if a drive lacks the protection."""
     used = PROTECTIONS[protection]
     return f"{used.purpose}; without: {used.without}"
 

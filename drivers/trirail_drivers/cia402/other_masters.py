@@ -28,7 +28,10 @@ _NMT_STOP: Final = 0x02
 
 
 class OtherMasters:
-    """Detection of other masters by their frames: NMT commands, SYNC, PDOs, and the heartbeat of this service."""
+    """Detection of other masters on the bus by frames that only this service may send.
+
+    These frames are NMT commands, SYNC, PDOs to the drives, and heartbeats with this service's node id.
+    """
 
     def __init__(self, wire: Wire, axes: Sequence[Cia402Axis], master_node: int) -> None:
         self._wire = wire

@@ -313,9 +313,9 @@ class Pdos:
         )
 
     async def _parameter(self, index: int, subindex: int, value: int) -> tuple[int, int] | None:
-        """Return subindex and value of a communication parameter that must be changed.
+        """Return `subindex` and `value` if this communication parameter of a PDO must be changed to `value`.
 
-        Return None if the drive lacks the parameter, or if the parameter already has the value.
+        Return None if the drive lacks the parameter, or if the parameter already equals `value`.
         """
         if not await self._remote.has(index, subindex) or await self._remote.peek(index, subindex) == value:
             return None

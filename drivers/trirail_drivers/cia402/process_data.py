@@ -77,7 +77,7 @@ class SetpointPdo:
 
 
 class FeedbackPdo:
-    """TPDO of the position, and of the statusword if it is mapped in the same PDO."""
+    """TPDO that contains the position, and also the statusword if both are mapped to the same PDO."""
 
     __slots__ = ("_layout", "_position", "_status", "entries", "has_status", "identifier", "size")
 
@@ -92,7 +92,7 @@ class FeedbackPdo:
         self.size = self._layout.size
 
     def offset(self, entry: int) -> int:
-        """Return the offset of an entry in a frame's data [bytes]; -1 if it is not mapped."""
+        """Return the offset of an entry in a frame's data [bytes]; -1 if the entry is not mapped."""
         if entry not in self.entries:
             return -1
         return sum((each & 0xFF) // 8 for each in self.entries[: self.entries.index(entry)])
@@ -179,7 +179,7 @@ class Exchange:
 
 
 def default_exchange(node: int, io: DigitalIo = NO_IO[0]) -> Exchange:
-    """Return the exchange that is used if a drive has every optional object of CiA 301 and CiA 402-2."""
+    """Return the PDOs for a drive that has every optional object of CiA 301 and CiA 402-2."""
     return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,
         SetpointPdo(canopen_frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),

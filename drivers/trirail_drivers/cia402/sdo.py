@@ -157,7 +157,7 @@ class Remote:
         if not size or not -1 << 8 * size - 1 <= value < 1 << 8 * size:
             raise SdoRefused(
                 f"drive {self.name}: cannot write {shown(*key, value)} to {self._called(key)}: "
-                f"it has {8 * size} bits, but {8 * width(key)} bits in the standard",
+                f"the drive's object has {8 * size} bits, but the standard requires {8 * width(key)} bits",
                 TOO_LONG,
             )
         return (value & (1 << 8 * size) - 1).to_bytes(size, "little")

@@ -125,7 +125,11 @@ def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequen
 
 
 def _mounted(built: Sequence[config.SimulatedSlider] | None, index: int, drive: config.Drive) -> DriveMounting:
-    """Return the actual axis of a simulated drive, found by its node id, or the configured axis if none is given."""
+    """Return the slider that a simulated drive actually moves, and the slider's scale.
+
+    `built` describes the simulated robot. If no entry of `built` has the drive's node id, the drive moves the slider
+    that the configuration assigns to the drive.
+    """
     for slider, each in enumerate(built or ()):
         if each.node == drive.node:
             return DriveMounting(slider, each.direction * each.counts_per_metre)

@@ -155,7 +155,10 @@ class Axis(Answers):
         return DriveFault(self.name, cause, code, shortened(f"drive {self.name}: {text}"))
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return a fault if the drive still has power `seconds` [s] after the command `wanted`, such as "disable"."""
+        """Return a fault if the drive still has power some time after a command such as "disable".
+
+        `seconds` is the time since the command [s], and `wanted` is the name of the command.
+        """
         raise NotImplementedError
 
     def silence_fault(self, now: float) -> DriveFault | None:

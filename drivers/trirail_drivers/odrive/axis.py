@@ -198,7 +198,10 @@ class OdriveAxis(Axis):
         return None
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return a fault if the drive still has power `seconds` [s] after the command `wanted`, such as "disable"."""
+        """Return a fault if the drive still has power some time after a command such as "disable".
+
+        `seconds` is the time since the command [s], and `wanted` is the name of the command.
+        """
         if not self.powered:
             return None
         text = f"is in {cansimple.state_name(self.state)} {seconds:g} s after {wanted}; expected idle"

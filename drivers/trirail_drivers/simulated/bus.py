@@ -45,7 +45,7 @@ class SimulatedBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
         """Deliver a frame to every drive. The answers of the drives can be received immediately.
 
-        Raises can.CanOperationError while the controller is bus-off; the error is that of a socket with a full queue.
+        While the controller is bus-off, raises the same can.CanOperationError as a socket with a full transmit queue.
         """
         if not self._exchange.receive(can_id(msg), bytes(msg.data), self._clock()):
             raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)

@@ -9,7 +9,7 @@ from trirail_drivers.simulated.servo import Servo
 
 
 class DriveMounting(NamedTuple):
-    """Slider that a drive actually moves, whatever the configuration says."""
+    """Slider that a drive actually moves, which may differ from the configured slider."""
 
     slider: int
     """Index of the slider."""
@@ -18,7 +18,7 @@ class DriveMounting(NamedTuple):
 
 
 class Carriages:
-    """Coupling of the three drives to the three sliders. Without a fault, each drive moves its own slider."""
+    """Coupling of the three drives to the three sliders. By default, each drive moves its own slider."""
 
     def __init__(self, servos: Sequence[Servo], counts_per_metre: Sequence[float]) -> None:
         """`counts_per_metre` is negative if the counts decrease as the slider position increases."""
@@ -29,7 +29,10 @@ class Carriages:
         self._places = [0.0] * len(self._servos)
 
     def couple(self, index: int, slider: int, ratio: float) -> None:
-        """Couple a drive to a slider, which moves `ratio` times as far as counted; a negative ratio reverses it."""
+        """Couple a drive to a slider. The slider moves `ratio` times as far as the drive counts.
+
+        A negative `ratio` reverses the direction.
+        """
         self.read()
         self._moves[index] = slider, ratio
 

@@ -91,7 +91,10 @@ class Device:
         return self.errors
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Connect the device to a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
+        """Connect the device to a bus and switch the device on at time `now` [s].
+
+        The device sends each frame by calling `transmit(can_id, data)`.
+        """
         self._transmit = transmit
         self._now = now
         self._reset(_ALL)

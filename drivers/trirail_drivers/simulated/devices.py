@@ -36,7 +36,10 @@ class SimulatedDevice(Protocol):
         """Digital outputs and inputs of the drive; None if its protocol has none."""
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Connect the drive to a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
+        """Connect the drive to a bus and switch the drive on at time `now` [s].
+
+        The drive sends each frame by calling `transmit(can_id, data)`.
+        """
 
     def receive(self, can_id: int, data: bytes, now: float) -> None:
         """Receive a data frame."""

@@ -241,7 +241,10 @@ class Dictionary:
         return entry
 
     def on_write(self, index: int, action: Callable[[ObjectEntry, int], None]) -> None:
-        """Call `action(entry, old value)` after each write to `index`. It can refuse the write by SdoAbortedError."""
+        """Call `action(entry, old value)` after each write to `index`.
+
+        `action` may raise SdoAbortedError to refuse the write.
+        """
         for entry in self._entries.values():
             if entry.index == index:
                 entry.on_write = action

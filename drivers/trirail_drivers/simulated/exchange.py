@@ -60,7 +60,7 @@ class SimulatedExchange:
             drive.poll(now)
 
     def _request(self, can_id: int, now: float) -> None:
-        """Deliver a remote frame to every drive, with the effects of faults."""
+        """Deliver a remote frame to every drive, subject to the active simulated faults."""
         for index in self._everyone:
             if self._faults.idle:
                 self._drives[index].receive_remote(can_id, now)
@@ -68,7 +68,7 @@ class SimulatedExchange:
                 self._faults.carry(index, True, can_id, b"", partial(self._deliver_request, index, can_id))
 
     def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
-        """Deliver a frame to some drives, with the effects of faults."""
+        """Deliver a frame to the drives with these indices, subject to the active simulated faults."""
         if self._faults.idle:
             now = self._clock()
             for index in indices:
@@ -84,7 +84,7 @@ class SimulatedExchange:
         self._drives[index].receive(can_id, data, self._clock())
 
     def _from_drive(self, index: int, others: Sequence[int], can_id: int, data: bytes) -> None:
-        """Deliver a drive's frame to the master and the other drives, with the effects of faults."""
+        """Deliver a drive's frame to the master and the other drives, subject to the active simulated faults."""
         if self._faults.idle:
             self._deliver_from_drive(others, can_id, data)
         else:

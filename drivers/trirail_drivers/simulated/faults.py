@@ -98,7 +98,7 @@ class Faults:
         self._emit: Callable[[int, bytes], None] = _to_nobody
 
     def connect(self, emit: Callable[[int, bytes], None], clock: Clock) -> None:
-        """Set the clock [s], and the receiver of injected frames, which takes an identifier with flags and the data."""
+        """Set the clock [s], and the function `emit(identifier with flags, data)` that receives injected frames."""
         self._emit = emit
         self._clock = clock
 

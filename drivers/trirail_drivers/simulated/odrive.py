@@ -116,7 +116,10 @@ class SimulatedOdrive:
         return None
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Connect the drive to a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
+        """Connect the drive to a bus and switch the drive on at time `now` [s].
+
+        The drive sends each frame by calling `transmit(can_id, data)`.
+        """
         self._transmit = transmit
         self._moved_at = now
         self._due = dict.fromkeys(("heartbeat", *_CYCLIC), now)

@@ -87,7 +87,10 @@ def average(pictures: Sequence[Observation]) -> Observation:
 def capture_after_motion(
     calibration: CameraCalibration, before: Observation, count: int, tolerance: float
 ) -> Generator[AlignmentRequest, Observation, PictureFit]:
-    """Capture pictures until `count` of them agree with the motion since `before`, or MAX_STALE_PICTURES contradict it.
+    """Capture pictures after a motion until enough of them show the current pose.
+
+    The capture ends when `count` pictures agree with the motion since the look `before`, or when MAX_STALE_PICTURES
+    pictures contradict the motion.
 
     Parameters
     ----------

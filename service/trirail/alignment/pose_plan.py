@@ -64,7 +64,7 @@ def find_candidates(
 
 
 def _projected(model: StageModel, state: StageState, name: str, poses: Floats) -> Floats:
-    """Return the pixels of a mark at poses, (N, 2)."""
+    """Return the pixel coordinates (N, 2) at which the mark `name` appears at each of N poses."""
     at, _ = carry(poses, np.array(state.places[name]))
     return np.asarray(project_points(state.views[model.view_of[name]], at))
 

@@ -92,7 +92,7 @@ class AlignmentTask(NamedTuple):
 
     @property
     def noise_share(self) -> float:
-        """Noise of a measurement, divided by the noise of a look of the calibration."""
+        """Ratio of a measurement's noise to the noise of a look during the calibration."""
         return math.sqrt(self.calibration.looks / self.looks)
 
     def check(self) -> None:

@@ -90,9 +90,9 @@ def worst_distance_error(points: Floats, targets: Floats) -> float:
 
 
 def find_swap(points: Floats, targets: Floats) -> tuple[int, ...] | None:
-    """Return an order of the points in which they are much closer to the targets; None if there is no such order.
+    """Return an order of the points that fits the targets much better than the given order; None if there is none.
 
-    Points that are in the correct order are closest to the targets if the part is rotated by less than 90°.
+    If the part is rotated by less than 90°, the correct order always fits best.
     """
     if len(points) > MAX_PERMUTED_MARKS:
         return None

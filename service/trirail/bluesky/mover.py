@@ -59,7 +59,7 @@ class AxisMove:
 
 @dataclass(eq=False, slots=True)
 class _Motion:
-    """Goal, and the sets that the goal carries out."""
+    """Goal, and the `set` calls of axes that end when this goal ends."""
 
     target: Pose
     goal: AsyncGoalHandle
@@ -68,7 +68,7 @@ class _Motion:
     """Whether the goal was stopped on request, which is not a failure."""
 
     def finish(self, result: Result) -> None:
-        """End the sets of this goal, with an error if the goal has failed."""
+        """End the `set` calls of this goal, with an error if the goal has failed."""
         failed = result.outcome != "done" and not self.interrupted
         end_all(self.moves, UnfinishedError(result) if failed else None)
 

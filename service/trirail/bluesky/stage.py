@@ -220,7 +220,7 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         return {self.name: (await self._stage.describe())[self.name]}
 
     async def read(self) -> Readings:
-        """Return the measured value of the next state."""
+        """Wait for the next state message and return the measured value in the message."""
         return self._own(await self._stage.read())
 
     async def locate(self) -> Location[T]:

@@ -179,7 +179,10 @@ def folder(
 
 
 class Codes:
-    """Codes in the pictures of one look, named by their numbers. A code must not appear in two pictures."""
+    """Positions of the codes that are found in all pictures taken for one look.
+
+    The name of each code is its number. A code must not appear in two pictures.
+    """
 
     def __init__(self, family: CodeFamily) -> None:
         self._family = family
@@ -187,7 +190,7 @@ class Codes:
         self.views: dict[str, str] = {}
 
     def add(self, picture: str, grey: Any) -> None:
-        """Find the codes in a picture. Raises TrirailError if one of them was in an earlier picture."""
+        """Find the codes in a picture. Raises TrirailError if a code is also in an earlier picture."""
         from trirail.alignment.coded_marks import find_codes
 
         for code in find_codes(grey, self._family):
@@ -300,7 +303,7 @@ def _opencv() -> Any:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class MarkSource:
-    """Source of the marks, which is one of --program, --pictures and --camera, and settings for their detection."""
+    """Options for the source of mark positions (--program, --pictures or --camera) and for the detection of marks."""
 
     program: str | None = None
     'A program that prints a line of JSON, {"mark": [u, v], …} in pixels, for each line that it reads.'

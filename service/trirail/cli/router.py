@@ -83,9 +83,9 @@ def settings(config: RouterConfig) -> dict[str, Any]:
     folder = Path(config.zenoh.tls.directory)
     if gone := sorted(revoked(folder) & config.behind.keys()):
         raise ServiceError(
-            f"{', '.join(gone)}: revoked, but listed in robots or routers, so the lost certificate would be accepted: "
-            "remove the name from the list, and give a robot or router that is still in use a certificate of another "
-            "name"
+            f"{', '.join(gone)}: revoked, but still listed in robots or routers, so the lost certificate would be "
+            "accepted: remove the name from the list; if the machine is still in use, create a certificate with a new "
+            "name for it"
         )
     own = Credentials.read_server(folder)
     if own.name in (*config.behind, *config.all_robots):

@@ -632,9 +632,9 @@ class AsyncRobot:
         return self._connection.events(history, seconds(timeout))
 
     def records(self, deliver: Callable[[bytes], None]) -> AbstractContextManager[Any]:
-        """Pass every batch of records to `deliver` until the context ends; trirail.wire.records.unpack decodes a batch.
+        """Return a context manager: within its context, `deliver` is called with every batch of records.
 
-        The event loop calls `deliver`, which must return quickly.
+        trirail.wire.records.unpack decodes a batch. The event loop calls `deliver`, which must return quickly.
         """
         return self._connection.records(deliver)
 

@@ -90,20 +90,20 @@ class AsyncConnection:
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
     ) -> None:
-        """Query the key made of `parts` without waiting; pass the reply or the error to `deliver` in the event loop.
+        """Send a query for the key that consists of `parts`; call `deliver` with the reply or error in the event loop.
 
         See Connection.post.
         """
         self._connection.post(parts, kind, payload, self._in_loop(deliver))
 
     def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
-        """Query the key made of `parts` without waiting for a reply."""
+        """Send a query for the key that consists of `parts`, without waiting for a reply."""
         self._connection.query_unanswered(parts, payload)
 
     async def nobody(self, *parts: str) -> ServiceError | RefusedError:
-        """Return the error to raise if no reply arrived on the key made of `parts`.
+        """Return the error to raise if no reply arrived to a query for the key that consists of `parts`.
 
-        The method queries the user's role, since the role may be the reason.
+        The method queries the user's role, because an insufficient role may be the reason.
         """
         reply = None
         if user := self._connection.to_be_asked_for_role(*parts):
@@ -146,7 +146,7 @@ class AsyncConnection:
         return self._connection.subscribe_to_events(self._in_loop(deliver), history=history)
 
     def records(self, deliver: Callable[[bytes], None]) -> AbstractContextManager[Any]:
-        """Pass every batch of records to `deliver` in the event loop, until the subscriber's context ends."""
+        """Return a context manager: within its context, the event loop calls `deliver` with every batch of records."""
         return self._connection.records(self._in_loop(deliver))
 
     async def _replies(

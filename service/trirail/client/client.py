@@ -291,9 +291,10 @@ class Robot:
     events = _iterator(AsyncRobot.events)
 
     def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
-        """Pass every batch of records to `deliver` until the context ends; trirail.wire.records.unpack decodes a batch.
+        """Call `deliver` with every batch of records until the returned subscriber is closed.
 
-        A thread of the connection calls `deliver`, which must return quickly.
+        trirail.wire.records.unpack decodes a batch. A thread of the connection calls `deliver`, which must return
+        quickly.
         """
         return self._connection.records(deliver)
 

@@ -78,13 +78,13 @@ class Connection:
     # ------------------------------------------------------------------ asking
 
     def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
-        """Query the key made of `parts` without waiting for a reply."""
+        """Send a query for the key that consists of `parts`, without waiting for a reply."""
         handler = zenoh.handlers.Callback(_ignore, indirect=False)
         with self.open_session() as session:
             session.get(**self.query(parts, payload, REPLY_WITHIN), handler=handler)
 
     def query(self, parts: tuple[str, ...], payload: bytes | None, within: float) -> dict[str, Any]:
-        """Return the arguments of zenoh.Session.get for a query of the key made of `parts`.
+        """Return the arguments of zenoh.Session.get for a query for the key that consists of `parts`.
 
         Zenoh sends a reply with the quality of service of its query, so the reply to a droppable query may be dropped.
         """
@@ -227,12 +227,12 @@ class Connection:
             )
 
     def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
-        """Pass every batch of records to `deliver`, until the subscriber's context ends."""
+        """Call `deliver` with every batch of records until the returned subscriber is closed."""
         with self.open_session() as session:
             return session.declare_subscriber(self.key("records"), self._reader.batches(deliver))
 
     def key(self, *parts: str) -> str:
-        """Return the robot's key made of `parts`."""
+        """Return the robot's key that consists of `parts`."""
         return zenoh_session.key(self.robot, *parts)
 
     @contextlib.contextmanager

@@ -420,7 +420,7 @@ def _labels(table: GeometryTable) -> Labels:
 
 _LEG_KEYS = {"3-PRP": ("edge_point", "edge_angle"), "3-PPR": ("pivot", "slide_angle")}
 """Keys of a leg that only one mechanism has."""
-_KIND_WORDS = {"3-PRP": "the platform's edge turns with it", "3-PPR": "the cross slide keeps its direction"}
+_KIND_WORDS = {"3-PRP": "the edge turns with the platform", "3-PPR": "the cross slide keeps its direction"}
 
 
 def _leg(kind: str, name: str, table: LegTable) -> AnyLeg:
@@ -429,8 +429,8 @@ def _leg(kind: str, name: str, table: LegTable) -> AnyLeg:
         for key in keys:
             if other != kind and getattr(table, key) is not None:
                 raise ConfigError(
-                    f"geometry: leg {name} has {key}, a key of kind {other} ({_KIND_WORDS[other]}); "
-                    f"kind is {kind}, whose keys are {' and '.join(_LEG_KEYS[kind])}"
+                    f"geometry: leg {name}: {key} is allowed only with kind {other} ({_KIND_WORDS[other]}); "
+                    f"with kind {kind}, use {' and '.join(_LEG_KEYS[kind])}"
                 )
     point, angle = (getattr(table, key) for key in _LEG_KEYS[kind])
     if point is None or (angle is None and kind == "3-PRP"):

@@ -112,7 +112,9 @@ class GoalQueue:
         self._ledger.keep_alive(request, self._alive_until(sent))
 
     def step(self, cycle: int, admit: Callable[[], bool], place: PoseSource) -> GoalRequest | None:
-        """Request a plan for the next goal, or accept a finished plan. Return the goal that begins, or None.
+        """Request a plan for the next goal, or accept a finished plan.
+
+        Return the goal if its plan has been accepted, so that its motion begins now; otherwise None.
 
         Parameters
         ----------

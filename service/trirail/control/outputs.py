@@ -290,7 +290,7 @@ class Outputs:
                 )
 
     def prepare(self, run: Run | None, version: int) -> None:
-        """Build the table of planned switches for a motion, unless the table is already up to date."""
+        """Build the table of digital outputs to switch during a motion, unless the table is already up to date."""
         goals = list(run.marks) if run is not None else []
         key = run, version, len(goals)
         if key == self._built_for:

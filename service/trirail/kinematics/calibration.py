@@ -74,7 +74,7 @@ def identify(
     """
     if len(poses) < MINIMUM:
         raise CalibrationError(
-            f"{len(poses)} poses are too few: at least {MINIMUM} are required, and some dozens are recommended"
+            f"{len(poses)} poses are too few: at least {MINIMUM} are required, and a few dozen are recommended"
         )
     for name, value in (("position", position_noise), ("angle", angle_noise)):
         if not (math.isfinite(value) and value > 0.0):

@@ -89,7 +89,7 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
         wanted = forward(geometry, sliders, near=poses) - poses
     except KinematicsError as error:
         raise CalibrationError(
-            f"a pose is out of reach of the geometry, or the columns or units are wrong: {error}"
+            f"a pose cannot be reached with the configured geometry, or the columns or units are wrong: {error}"
         ) from error
     wanted[:, 2] -= 2.0 * math.pi * np.round(wanted[:, 2] / (2.0 * math.pi))
 

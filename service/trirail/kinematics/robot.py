@@ -190,4 +190,5 @@ def _refuse_loops(geometry: Geometry, sliders: Array, near: Array, place: str) -
         x, y, phi = (worded(value, unit) for value, unit in zip(near.tolist(), ("m", "m", "rad"), strict=True))
         message = f"{readings}: near = ({x}, {y}, {phi}) is a singular pose"
         raise KinematicsError(message, value=float(near[2]))
-    raise KinematicsError(f"{readings}: singular: |det J2| = {worded(det, 'm')} there", value=det, limit=limit)
+    message = f"{readings}: the mechanism is singular at these positions (|det J2| = {worded(det, 'm')})"
+    raise KinematicsError(message, value=det, limit=limit)

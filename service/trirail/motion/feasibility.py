@@ -189,7 +189,7 @@ class Checker:
         return SampleResult(worst, within_limits, leaves_at)
 
     def keeps_limits(self, worst: Array) -> bool:
-        """Return whether rates, given like SampleResult.worst, stay within the limits for changes of rate."""
+        """Return whether the greatest rates, as in SampleResult.worst, stay within the limits for changes of rate."""
         return bool((worst <= self._laws).all())
 
     def worst_shares(self, path: Path, pose: Sequence[float]) -> Array:

@@ -60,4 +60,4 @@ class GoalMotion(Generic[G]):
         RefusedError
             No path leads to the goal.
         """
-        raise NotImplementedError(f"{type(goal).__name__} is resolved to another kind of goal")
+        raise NotImplementedError(f"{type(goal).__name__} has no path itself: plan the goal that resolve returns")

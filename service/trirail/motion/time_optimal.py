@@ -232,7 +232,10 @@ def _factorise(band: Array) -> bool:
 
 @compiled()
 def _substitute(band: Array, x: Array) -> None:
-    """Solve the system for the right-hand side `x` in place, given its Cholesky factor `band`."""
+    """Replace the right-hand side `x` of a linear system by the solution.
+
+    `band` is the banded Cholesky factor of the system's matrix.
+    """
     n = len(band)
     for row in range(n):
         for d in range(1, min(COEFFICIENTS_PER_INTERVAL - 1, row) + 1):
@@ -334,7 +337,7 @@ def limit_excess(samples: Array, limits: Array, c: Array, h: float) -> float:
 
 @compiled("void(f8[::1], f8, f8[:, ::1])")
 def spline_states(c: Array, h: float, out: Array) -> None:
-    """Write sigma, v, a, j of a law at the start of each interval, (n, 4)."""
+    """Fill `out` (n, 4) with sigma, v, a and j of the spline with coefficients `c` at the start of each interval."""
     weights = np.empty((4, COEFFICIENTS_PER_INTERVAL))
     _spline_weights(0.0, h, weights)
     for k in range(len(out)):

@@ -164,7 +164,7 @@ class Feed:
             self.changed.notify_all()
 
     def _keep(self, look: AlignmentLook, event: tuple[int, bytes]) -> None:
-        """Store an event together with the earlier events of the same alignment; forget an earlier alignment."""
+        """Store an event of an alignment; an event of a new alignment replaces all events of the previous alignment."""
         name = look.id, look.purpose
         self._alignment_events = [*(self._alignment_events if name == self._alignment else ()), event][-MAX_LOOKS:]
         self._alignment = name

@@ -60,7 +60,9 @@ def called(pollfds: NDArray[np.int32]) -> bool:
 
 @compiled(b1(i8, POLLFDS, i8[::1]), releases=True)
 def wait(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
-    """Wait for the deadline, or for a call more than SPARE_NS before the deadline. Return True if there is a call.
+    """Wait for the deadline, or until a neighbour calls. Return True if a neighbour has called.
+
+    A call less than SPARE_NS before the deadline is ignored.
 
     Parameters
     ----------
@@ -103,7 +105,10 @@ class PollSet:
         return bool(called(self.pollfds))
 
     def wait(self, deadline_ns: int) -> bool:
-        """Wait for the deadline or for an early call, like the function `wait`. Return True if there is a call."""
+        """Wait for the deadline, or until a neighbour calls. Return True if a neighbour has called.
+
+        A call less than SPARE_NS before the deadline is ignored; see the module's function `wait`.
+        """
         self.refresh()
         return bool(wait(deadline_ns, self.pollfds, self._moment))
 

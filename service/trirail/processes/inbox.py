@@ -123,7 +123,7 @@ class Inbox:
             return self._due(self._clock())
 
     def earlier(self, number: int) -> bool:
-        """Return True if a message other than a stop that arrived before message `number` has not been read yet."""
+        """Return True if any unread message, except stops, arrived before the message with this `number`."""
         with self._lock:
             return any(self._others.first(user).number < number for user in self._others.users)
 

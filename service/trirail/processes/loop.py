@@ -188,7 +188,7 @@ class Loop:
         self._mark(Part.DECIDE)
 
     def _handle_urgent(self, inputs: Iterable[Request | Disturbance], now_ns: int) -> None:
-        """Apply stops and disturbances in the present cycle."""
+        """Handle urgent requests, such as stops, and disturbances, such as a lost process, in the present cycle."""
         for each in inputs:
             self._reports.note(now_ns, each, urgent=True)
             self.control.handle(each, now_ns)

@@ -287,5 +287,7 @@ class Looks:
         level: Level = "info" if look.end in SUCCESSFUL_ENDS else "warning"
         text = alignment_event_text(look, in_words(look))
         if not self._announce(Notice("alignment", level, text.text, user=user, alignment=look, **text.fields)):
-            raise RefusedError(RefusalCode.BUSY, "the queue of messages to the loop is full: send the look again")
+            raise RefusedError(
+                RefusalCode.BUSY, "the loop's message queue is full: send the observation of the marks again"
+            )
         return look

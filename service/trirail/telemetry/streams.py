@@ -77,10 +77,10 @@ class Streams:
         self._streams.append(stream)
 
     def attach(self, sink: Sink, drawing_hz: int) -> None:
-        """Forward all subsequent messages to a sink, with `drawing_hz` batches of drawings per second.
+        """Send all subsequent data to a sink. The records are drawn in `drawing_hz` batches per second.
 
-        Another call changes the rate. Sinks with the same rate share their drawings, because drawing is the most
-        expensive step.
+        Another call changes the rate for this sink. Sinks with the same rate share their drawings, because drawing is
+        the most expensive step.
         """
         if self._rates.get(sink) == drawing_hz:
             return

@@ -27,7 +27,7 @@ _Rule = dict[str, Any]
 
 
 def least_role(*parts: str) -> Role:
-    """Return the lowest role that may query the key made of `parts`, such as ("cmd", user, "enable")."""
+    """Return the lowest role that may query the key that consists of `parts`, such as ("cmd", user, "enable")."""
     if parts[0] in ("goal", "check", "alignment"):
         return GOAL_ROLE
     if parts[0] in ("teach", "forget"):
@@ -39,10 +39,10 @@ def access_control(robot: str, users: Mapping[str, Role], router: str | None = N
     """Return the section access_control of Zenoh's configuration for the service of a robot.
 
     Users can send messages only under their own name, because the key of a message contains the user's name and the
-    rule for this key applies only to the certificate with the same common name. Every certificate may query a role, so
-    that a user without permissions can find out the reason. Messages through a router do not carry a user's
-    certificate. The service therefore lets the router send under every name, and the router enforces the rules of its
-    users.
+    rule for this key applies only to the certificate with the same common name. The owner of
+    any certificate may query the role of a user name, so that a user whose requests are denied can find out that the
+    role does not permit them. Messages through a router do not carry a user's certificate. The service therefore lets
+    the router send under every name, and the router enforces the rules of its users.
     """
     asking, using = list(_certificate_rules(robot)), list(_viewer_rules(robot))
     rules, policies = asking + using, [_policy("every certificate", asking)]
@@ -106,7 +106,10 @@ def _router_rules(robot: str) -> Iterator[_Rule]:
 
 
 def _mirrored(name: str, rule: _Rule) -> _Rule:
-    """Return the rule for the other end of the connection, with the opposite direction and `name` before its id."""
+    """Return the matching rule for the other end of the connection.
+
+    The direction is reversed, and the id begins with `name`.
+    """
     (flow,) = rule["flows"]
     return rule | {"id": f"{name}: {rule['id']}", "flows": ["egress" if flow == "ingress" else "ingress"]}
 

@@ -86,9 +86,9 @@ def _escaped(character: str) -> str:
 
 
 def check_name(name: str, whose: str) -> str:
-    """Check the name of a robot, user or pose; return the name. Raises RefusedError if the name is invalid.
+    """Check the name of a robot, user or pose, and return the name.
 
-    `whose` is the kind of name in the error message, such as "robot".
+    `whose` tells the error message what is named, such as "robot". Raises RefusedError if the name is invalid.
     """
     if not isinstance(name, str) or not is_name(name):
         raise RefusedError(RefusalCode.BAD_NAME, f"{whose} {quoted(str(name))!r} is not a valid name; use {NAME_RULE}")

@@ -27,7 +27,10 @@ def client(credentials: Credentials) -> ssl.SSLContext:
 
 
 def peer(connection: ssl.SSLSocket) -> str:
-    """Return the common name of the peer's certificate; "" if it has none or several, or without a certificate."""
+    """Return the common name in the peer's certificate.
+
+    Return "" if the peer has no certificate, or if the certificate does not have exactly one common name.
+    """
     subject: Any = (connection.getpeercert() or {}).get("subject", ())
     names = [value for part in subject for key, value in part if key == "commonName"]
     return names[0] if len(names) == 1 else ""
