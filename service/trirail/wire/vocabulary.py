@@ -190,9 +190,7 @@ class Command(StrEnum):
         stops=True,
         ignores_lease=True,
     )
-    RESET = _CommandRow(
-        "reset", "Clear a fault whose cause has been removed; the drives stay disabled.", Role.MAINTAINER
-    )
+    RESET = _CommandRow("reset", "Clear a fault whose cause is removed; the drives stay disabled.", Role.MAINTAINER)
     HOME = _CommandRow(
         "home",
         "Home the sliders without absolute encoders.",
