@@ -240,7 +240,7 @@ def test_keys_in_a_list_choose_and_move_nothing_but_stop_is_stop(page: Page, rob
         ("a.json", "[" * 5000, "Expected object, got array"),
         ("a.csv", "t,x,y,phi\n0,0,0,0\n9,0.5,0,0\n", "leaves the workspace"),
         ("a.csv", "t,x,y,phi\n0,0,0,0\n0,0.01,0,0\n", "times must rise"),
-        ("a.csv", "t,x,y,phi\n" + "".join(f"{k},0,0,0\n" for k in range(5001)), "5000 at most"),
+        ("a.csv", "t,x,y,phi\n" + "".join(f"{k},0,0,0\n" for k in range(5001)), "maximum of 5000"),
         ("a.csv", "x" * 1_600_000, "too large"),
     ],
 )
