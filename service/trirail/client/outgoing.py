@@ -81,8 +81,8 @@ def too_many(number: int) -> str:
         return ""
     step = -(-number // MAX_POINTS)
     return (
-        f"{number} points exceed the maximum of {MAX_POINTS}: send one point of each {step} and the last, since paths are "
-        "quintic between points, or send parts that each end at rest"
+        f"{number} points exceed the maximum of {MAX_POINTS}: send one in {step} points and the last, since paths "
+        "are quintic between points, or send parts that each end at rest"
     )
 
 
