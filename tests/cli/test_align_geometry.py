@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import json
-import re
 import signal
 import sys
 import tomllib
@@ -13,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import patient
 import pytest
 import warm
 from alignment.cameras import FIELD as FIELD_PX
@@ -68,11 +68,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]
     """Return the configuration and the locator of a service of a stage."""
     folder = tmp_path_factory.mktemp("stage")
     locator = f"unixsock-stream/{folder}/zenoh"
-    text = SIM.with_name("uvw.toml").read_text(encoding="utf-8")
-    for key, value in ({"listen": f'["{locator}"]'} | own_service.PATIENT).items():
-        text = re.sub(rf"^{key} = [^#\n]*", f"{key} = {value} ", text, flags=re.MULTILINE)
-    config = folder / "uvw.toml"
-    config.write_text(text.replace("[telemetry]", "[telemetry]\nlive_port = 0"), encoding="utf-8")
+    config = patient.write(folder, "uvw.toml", locator)
     with own_service.service(config, folder / "session.rrd"), Robot("uvw", locator) as robot:
         robot.enable()
         yield config, locator
