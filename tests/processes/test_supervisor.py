@@ -263,7 +263,7 @@ def test_a_frozen_fork_server_ends_the_service_when_a_child_is_wanted(
         "up",
         "the gateway has died (exit code unknown): the loop stops the robot and holds its position; restarting it",
         "the process that starts the others has died (no sign of life for 0.5 s, so it was killed): the loop stops the "
-        "robot and disables the drives; ending",
+        "robot and disables the drives; the service ends",
     ]
 
 
