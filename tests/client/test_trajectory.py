@@ -79,7 +79,7 @@ def test_more_points_than_fit_are_refused_before_sending_with_both_numbers(tmp_p
     path = tmp_path / "path.csv"
     path.write_text("t,x,y,phi\n" + "".join(f"{t},{x},{y},{phi}\n" for t, x, y, phi in rows))
     for points in (rows, path):
-        with pytest.raises(TrirailError, match=rf"{number} points exceed the maximum of 5000: send every "):
+        with pytest.raises(TrirailError, match=rf"{number} points exceed the maximum of 5000: send one in "):
             points_of(points)
 
 

@@ -115,14 +115,15 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         link = await self._stage.link()
         try:
             result = await link.mover.settle(goal)
-            if not self._has_marks:  # the last states may arrive after the result
-                end = goal.id, self._stage.readings(await link.robot.state())
-                if end not in self._samples[-1:]:
-                    self._samples.append(end)
         finally:
             self._end_sampling()
-        if goal is not self._interrupted:
-            check_done(result)
+        if goal is self._interrupted:
+            return
+        check_done(result)
+        if not self._has_marks:  # the last states may arrive after the result
+            end = goal.id, self._stage.readings(await link.robot.state())
+            if end not in self._samples[-1:]:
+                self._samples.append(end)
 
     async def stop(self, success: bool = True) -> None:
         """Stop the path; return when the robot is at rest."""
