@@ -370,8 +370,8 @@ def test_a_robot_or_router_that_is_revoked_is_not_let_in(net: Net, tmp_path: Pat
     ("name", "said"),
     [
         ("ann", "ann/cert.pem: the certificate of user ann is not valid for a robot or router"),
-        ("demo", "demo: the certificate of demo, which is behind this router"),
-        ("other", "other: the certificate of other, which is behind this router"),
+        ("demo", "demo: this is the certificate of demo, which is behind this router"),
+        ("other", "other: this is the certificate of other, which is behind this router"),
     ],
 )
 def test_a_router_does_not_start_as_a_user_or_as_one_of_its_robots(net: Net, name: str, said: str) -> None:
