@@ -14,8 +14,8 @@ from alignment.cameras import Stage, camera, part_at
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.alignment.images import Pair
-from trirail.alignment.procedure import Alignment, AlignmentTask, align, calibrate_by_moves, measure_part
-from trirail.client.alignment import UnrecordedAlignmentWarning, drive, drive_async
+from trirail.alignment.procedure import Alignment, AlignmentTask, StageMotion, align, calibrate_by_moves, measure_part
+from trirail.client.alignment import UnrecordedAlignmentWarning, drive, drive_async, goals
 from trirail.errors import AlignmentError, RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary
 from trirail.wire.looks import AlignmentLook
@@ -38,8 +38,6 @@ class Told:
 
     def send(self, goal: Any) -> Any:
         motion = (goal.x, goal.y, goal.phi)
-        from trirail.alignment.procedure import StageMotion
-
         self.stage.go(StageMotion(motion, getattr(goal, "tool", None)))
         return SimpleNamespace(wait=lambda _: SimpleNamespace(outcome="done"), result=None)
 
@@ -226,3 +224,22 @@ def test_a_refused_motion_stops_nothing() -> None:
 
     with pytest.raises(RefusedError, match="disabled"):
         Refusing(4).drive(calibrate_by_moves())
+
+
+TRIPLES = st.tuples(*[st.floats(-1e-2, 1e-2)] * 3)
+
+
+@given(TRIPLES, st.none() | TRIPLES, st.booleans())
+def test_the_goals_of_a_motion_end_at_its_end_whatever_the_approach(
+    by: Triple, approach: Triple | None, is_relative: bool
+) -> None:
+    """A relative motion adds up; an absolute one goes beyond its end first, and then there."""
+    found = [
+        (goal.x, goal.y, goal.phi)
+        for goal in goals(StageMotion(by, (0.0, 0.0) if is_relative else None, approach), 0.5)
+    ]
+    assert len(found) == 1 + (approach is not None)
+    end = np.sum(found, axis=0) if is_relative else found[-1]
+    assert end == pytest.approx(by, abs=1e-15)
+    if approach is not None:
+        assert found[0] == pytest.approx(np.add(by, approach), abs=1e-15)
