@@ -234,10 +234,8 @@ def test_the_goals_of_a_motion_end_at_its_end_whatever_the_approach(
     by: Triple, approach: Triple | None, is_relative: bool
 ) -> None:
     """A relative motion adds up; an absolute one goes beyond its end first, and then there."""
-    found = [
-        (goal.x, goal.y, goal.phi)
-        for goal in goals(StageMotion(by, (0.0, 0.0) if is_relative else None, approach), 0.5)
-    ]
+    made: list[Any] = list(goals(StageMotion(by, (0.0, 0.0) if is_relative else None, approach), 0.5))
+    found = [(goal.x, goal.y, goal.phi) for goal in made]
     assert len(found) == 1 + (approach is not None)
     end = np.sum(found, axis=0) if is_relative else found[-1]
     assert end == pytest.approx(by, abs=1e-15)

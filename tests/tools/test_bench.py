@@ -154,3 +154,7 @@ def test_the_intervals_of_sync_are_measured_beside_a_plain_loop_and_the_machine(
     assert rows["SYNC's interval off its period to the machine's lateness spread, p99 / p99.9"]["measured"] == tuple(
         ratios
     )
+    theirs = found["deviation_us"]["python-canopen, SCHED_FIFO, with setpoints"]
+    assert rows["SYNC's interval off its period to python-canopen's with setpoints, p99 / p99.9"]["measured"] == tuple(
+        found["deviation_us"]["trirail, moving"][k] / theirs[k] for k in (1, 2)
+    )
