@@ -137,3 +137,12 @@ def test_a_correction_that_is_on_is_said(capsys: pytest.CaptureFixture[str]) -> 
     words = " ".join(capsys.readouterr().out.split())
     assert "corrected map.toml, measured 2026-05-01: up to 50.0 µm in x, 40.0 µm in y, 0.100 mrad; " in words
     assert "backlash of A 50.0 µm, B 0.0 µm, C 10.0 µm" in words
+
+
+def test_the_share_of_the_time_that_the_bus_leaves_fits_a_narrow_terminal() -> None:
+    state = a_state()
+    late = msgspec.structs.replace(state.loop, setpoints_us=Percentiles(58.0, 234.0, 731.0, 9886.0))
+    console = Console(width=80, color_system=None, no_color=True)
+    with console.capture() as captured:
+        console.print(live.table(msgspec.structs.replace(state, loop=late), "demo", NAMES, LIMITS))
+    assert "p50 12%, p99.9 146%, worst 1977% of the 500 µs that the bus leaves" in captured.get()

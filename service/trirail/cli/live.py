@@ -124,8 +124,8 @@ def table(state: State, robot: str, labels: Labels, limits: Limits | None = None
     grid.add_row("loop", f"{words}, bus {loop.bus_load_measured:.0%} of at most {loop.bus_load:.0%}")
     grid.add_row("lateness", percentiles(loop.lateness_us))
     grid.add_row("cycle", percentiles(loop.cycle_us))
-    share = budget_share(loop.setpoints_us, loop.setpoint_budget_us)
-    grid.add_row("setpoints", f"{percentiles(loop.setpoints_us)}: {share}")
+    grid.add_row("setpoints", percentiles(loop.setpoints_us))
+    grid.add_row("budget", budget_share(loop.setpoints_us, loop.setpoint_budget_us))
     for lack in loop.lacking:
         grid.add_row("[yellow]without[/]", plain(lack))
     for warning in state.warnings:
