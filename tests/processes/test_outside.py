@@ -313,7 +313,8 @@ while True:  # asks, and is stopped in the middle of it
             assert asker.stdout.readline() == b"ready\n"
             frozen.append(asker)
         for _ in range(3):
-            robot.info()
+            with contextlib.suppress(RefusedError):  # the askers' questions fill the queue of users without a name
+                robot.info()
         for asker in frozen:
             os.kill(asker.pid, signal.SIGSTOP)
         for number in range(20):
