@@ -219,4 +219,6 @@ def _show_sync(peers: Results) -> None:
     machine = {f"the machine's lateness spread, {when}": values for when, values in peers["machine_us"].items()}
     for name, values in {**machine, **peers["deviation_us"]}.items():
         print(f"{name:50}" + "".join(f"{value:8.0f}" for value in values))
-    print(f"LinuxCNC's servo thread: {peers['linuxcnc']}\n")
+    if peers["linuxcnc"]:
+        print(f"LinuxCNC's servo thread: {peers['linuxcnc']}")
+    print()

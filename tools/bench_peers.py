@@ -1,14 +1,14 @@
-"""Intervals of SYNC at the drives: trirail's loop, python-canopen's SYNC, and the machine's own wake-ups.
+"""Intervals of SYNC at the drives: trirail's loop, python-canopen's SYNC, LinuxCNC's servo thread, and the machine.
 
 trirail and python-canopen send over the same bus between processes to the same drives, which note when each SYNC
-arrives. python-canopen runs unchanged, with the loop's privileges, and with setpoints. The machine's own lateness is
-measured before and after them, with the same priority on the same processor.
+arrives. python-canopen runs unchanged, with the loop's privileges, and with setpoints. LinuxCNC's servo thread drives
+no drives, so its intervals are those of its own clock. The machine's own lateness is measured before and after them,
+with the same priority on the same processor.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import bench_linuxcnc
 import numpy as np
 from bench_beside import Beside
 from bench_rig import QUANTILES, configured, drives, quantiles, rig, without_pause
@@ -42,6 +43,9 @@ def measure(seconds: float) -> dict[str, Any]:
         "python-canopen, SCHED_FIFO": _canopen(seconds, "real time"),
         "python-canopen, SCHED_FIFO, with setpoints": _canopen(seconds, "setpoints"),
     }
+    linuxcnc = _linuxcnc(seconds)
+    if not isinstance(linuxcnc, str):
+        deviations["LinuxCNC's servo thread, without drives"] = linuxcnc
     after = _machine(seconds)
     machine = [max(pair) for pair in zip(before, after, strict=True)]
     return {
@@ -50,7 +54,7 @@ def measure(seconds: float) -> dict[str, Any]:
         "deviation_us": deviations,
         "machine_us": {"before": before, "after": after},
         "ratio": [ours / own for ours, own in zip(deviations["trirail, moving"], machine, strict=True)],
-        "linuxcnc": _linuxcnc(),
+        "linuxcnc": linuxcnc if isinstance(linuxcnc, str) else "",
     }
 
 
@@ -94,11 +98,15 @@ def _deviations(arrivals: list[float]) -> list[float]:
     return quantiles(np.abs(np.diff(arrivals) - 1.0 / RATE) * 1e6)
 
 
-def _linuxcnc() -> str:
-    """Return a sentence that states whether LinuxCNC's servo thread can be compared on this machine."""
-    if shutil.which("halrun") is None:
-        return "not installed (Debian's package is linuxcnc-uspace): no servo thread to compare with"
-    return "installed: run its latency-histogram beside this, it measures its servo thread itself"
+def _linuxcnc(seconds: float) -> list[float] | str:
+    """Return the deviations of LinuxCNC's servo thread at QUANTILES [µs], or why there are none."""
+    if not bench_linuxcnc.INSTALLED:
+        return "not installed (Debian's package is linuxcnc-uspace)"
+    try:
+        measured = bench_linuxcnc.intervals(seconds, RATE, PRIORITY)
+    except (OSError, RuntimeError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    return quantiles(np.abs(measured - 1.0 / RATE) * 1e6)
 
 
 def _send_sync(path: str, seconds: float, way: str) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import bench
@@ -14,6 +16,7 @@ import bench_fairness
 import bench_frames
 import bench_geometry
 import bench_latency
+import bench_linuxcnc
 import bench_loop
 import bench_peers
 import bench_rig
@@ -102,6 +105,26 @@ def test_what_a_goal_changes_first_is_a_setpoint_after_it_with_another_feed_forw
 def test_the_deviation_of_an_interval_has_no_sign() -> None:
     arrivals = np.cumsum([1e-3 + 5e-6 * (-1) ** n for n in range(bench_peers.RATE)])
     assert bench_peers._deviations(arrivals.tolist()) == pytest.approx([5.0] * len(QUANTILES), abs=1e-3)
+
+
+def test_linuxcnc_that_is_not_installed_or_does_not_start_is_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(bench_linuxcnc, "INSTALLED", False)
+    assert bench_peers._linuxcnc(1.0) == "not installed (Debian's package is linuxcnc-uspace)"
+    monkeypatch.setattr(bench_linuxcnc, "INSTALLED", True)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    halrun = tmp_path / "halrun"
+    halrun.write_text("#!/bin/sh\necho no shared memory\nexit 1\n", encoding="utf-8")
+    halrun.chmod(0o755)
+    assert bench_peers._linuxcnc(1.0) == "LinuxCNC did not run: no shared memory"
+    # The last word of its script is the file for the samples; a first sample of no interval is left out.
+    halrun.write_text(
+        '#!/bin/sh\nfile=$(tail -n 1 "$2"); file=${file##* }\necho "0 " > "$file"\necho overrun >> "$file"\n'
+        'for k in 1 2 3 4 5; do echo "1007000 " >> "$file"; echo "995000 " >> "$file"; done\n',
+        encoding="utf-8",
+    )
+    assert bench_peers._linuxcnc(0.01) == pytest.approx([6.0, 7.0, 7.0, 7.0])
 
 
 def test_an_aim_is_met_where_no_number_is_greater() -> None:
