@@ -22,7 +22,7 @@ INSTALLED = shutil.which("halrun") is not None and shutil.which("halsampler") is
 """Whether LinuxCNC is installed."""
 _SETTLE = 1.0
 """Duration from the priority change until the intervals count [s]."""
-_PATIENCE = 30.0
+_START_TIMEOUT = 30.0
 """Maximum time that LinuxCNC may take in addition to the measurement [s]."""
 _HAL = """\
 loadrt threads name1=servo period1={period_ns}
@@ -58,7 +58,7 @@ def intervals(seconds: float, rate_hz: int, priority: int) -> NDArray[np.float64
         )
         try:
             _raise_priority(halrun, str(folder), priority)
-            output, _ = halrun.communicate(timeout=seconds + _SETTLE + _PATIENCE)
+            output, _ = halrun.communicate(timeout=seconds + _SETTLE + _START_TIMEOUT)
         finally:
             if halrun.poll() is None:
                 halrun.terminate()
@@ -71,7 +71,7 @@ def intervals(seconds: float, rate_hz: int, priority: int) -> NDArray[np.float64
 
 def _raise_priority(halrun: subprocess.Popen[bytes], folder: str, priority: int) -> None:
     """Give the servo thread of the `rtapi_app` that uses `folder` a real-time priority and the last processor."""
-    end = time.monotonic() + _PATIENCE
+    end = time.monotonic() + _START_TIMEOUT
     while halrun.poll() is None and time.monotonic() < end:
         for thread in _servo_threads(folder):
             os.sched_setaffinity(thread, {max(os.sched_getaffinity(0))})
@@ -82,12 +82,12 @@ def _raise_priority(halrun: subprocess.Popen[bytes], folder: str, priority: int)
 
 def _servo_threads(folder: str) -> list[int]:
     """Return the servo threads of all `rtapi_app` processes whose environment names `folder`."""
-    found = []
+    threads = []
     for task in Path("/proc").glob("[0-9]*/task/[0-9]*"):
         try:
             named = (task / "comm").read_text().startswith("rtapi_app:T")
             if named and folder.encode() in (task.parent.parent / "environ").read_bytes():
-                found.append(int(task.name))
+                threads.append(int(task.name))
         except OSError:  # the process has ended
             continue
-    return found
+    return threads
