@@ -14,7 +14,7 @@ records at the latest.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numba import f8, from_dtype, i8, types, u1, u8
@@ -69,6 +69,8 @@ class Reached(IntEnum):
     """The cycle is complete, and a neighbour has called during the wait for the next tick."""
 
 
+GO_ON: Final = -1
+"""Result of a stage of a cycle if the cycle continues with the next stage."""
 FOLLOW, HOLD, COMMAND = 0, 1, 2
 """Sources of the setpoints: FOLLOW for the measured positions, HOLD for a platform at rest, COMMAND for a motion."""
 
@@ -127,6 +129,103 @@ STATE = np.dtype(
 _STATE = from_dtype(STATE)[::1]
 
 
+class Exchange(NamedTuple):
+    """Tables of the frames that a cycle exchanges with the drives, as in trirail_drivers.driver.cyclic.Cyclic."""
+
+    bus: NDArray[np.int64]
+    """BusAccess of the bus, (3,)."""
+    arrived: NDArray[np.uint8]
+    arrivals: NDArray[np.uint64]
+    """Memory for received frames, and the headers of these frames."""
+    starts: NDArray[np.uint8]
+    begin: NDArray[np.uint64]
+    """Frames at the start of a cycle, and their headers."""
+    signs: NDArray[np.uint8]
+    beats: NDArray[np.uint64]
+    """Periodic frames, and their headers."""
+    setpoints: NDArray[np.uint8]
+    departures: NDArray[np.uint64]
+    """Setpoint frames, and the headers of the frames at the end of a cycle."""
+    pins: NDArray[np.uint8]
+    switchings: NDArray[np.uint64]
+    """Frames for the outputs of the drives, and their headers."""
+    expected: NDArray[np.void]
+    axes: NDArray[np.void]
+    times: NDArray[np.void]
+    history: Array
+
+
+class Neighbours(NamedTuple):
+    """Memory shared with other parts of the service."""
+
+    pollfds: NDArray[np.int32]
+    """Array of struct pollfd, of which the first is that of the gateway, (n, 2)."""
+    hearts: NDArray[np.uint64]
+    """Counters of trirail.processes.heartbeats."""
+    batch: NDArray[np.uint8]
+    """Memory for packed records, (n, SIZE)."""
+
+
+class RobotArrays(NamedTuple):
+    """Arrays of trirail.control.cycle that stay the same for all motions."""
+
+    legs: Array
+    bounds: NDArray[np.void]
+    motion: Array
+    sliders: Array
+    backlash: NDArray[np.void]
+    refused_values: Array
+    feedback: NDArray[np.void]
+    written: Array
+    jumps: NDArray[np.bool]
+    scratch: Array
+    monitored: NDArray[np.void]
+    record: NDArray[np.void]
+    packed: NDArray[np.uint8]
+    """Bytes of `record`, (SIZE,)."""
+
+
+class MotionArrays(NamedTuple):
+    """Arrays of trirail.control.cycle that describe the current motion: a path and the time law along it."""
+
+    knots: Array
+    pieces: Array
+    tools: Array
+    law_knots: Array
+    law_pieces: Array
+    furthest: Array
+
+
+class OutputArrays(NamedTuple):
+    """Tables of outputs, the same as in trirail.control.outputs.switch."""
+
+    switches: NDArray[np.void]
+    planned: NDArray[np.void]
+    words: NDArray[np.int64]
+    log: NDArray[np.void]
+
+
+def _typed(kind: type, *members: Any) -> Any:
+    """Return the numba type of a named tuple of arrays."""
+    return types.BaseTuple.from_types(members, kind)
+
+
+_HEADERS = u8[:, ::1]
+_EXCHANGE = _typed(
+    Exchange,
+    *(i8[::1], FRAMES, _HEADERS, FRAMES, _HEADERS, FRAMES, _HEADERS, FRAMES, _HEADERS, FRAMES, _HEADERS),
+    *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1]),
+)
+_NEIGHBOURS = _typed(Neighbours, POLLFDS, u8[::1], FRAMES)
+_ROBOT = _typed(
+    RobotArrays,
+    *(cycle.LEGS, cycle.BOUND, cycle.MOTION, cycle.SLIDERS, cycle.BACKLASH_STATES, f8[::1], cycle.FEEDBACKS),
+    *(f8[:, ::1], types.b1[::1], f8[:, ::1], cycle.MONITORED, cycle.RECORD, u1[::1]),
+)
+_MOTION = _typed(MotionArrays, cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1])
+_OUTPUTS = _typed(OutputArrays, outputs.OUTPUTS, outputs.PLAN, i8[::1], outputs.LOG)
+
+
 @compiled()
 def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
     if state[0].injected_ns >= 0:
@@ -154,213 +253,193 @@ def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None
 
 
 @compiled()
-def _receive(
-    s: Any,
-    bus: NDArray[np.int64],
-    arrivals: NDArray[np.uint64],
-    arrived: NDArray[np.uint8],
-    moment: NDArray[np.int64],
-    expected: NDArray[np.void],
-    axes: NDArray[np.void],
-    times: NDArray[np.void],
-    t: float,
-) -> bool:
+def _receive(s: Any, moment: NDArray[np.int64], frames: Exchange, t: float) -> bool:
     """Receive and process frames. Return True if there was no error, all frames were expected and no frame is left."""
-    s.arrived, s.error = receive_frames(bus, arrivals, arrived, moment)
-    s.handled = process_frames(arrived, s.arrived, expected, axes, times, t)
+    s.arrived, s.error = receive_frames(frames.bus, frames.arrivals, frames.arrived, moment)
+    s.handled = process_frames(frames.arrived, s.arrived, frames.expected, frames.axes, frames.times, t)
     return bool(s.error == 0 and s.handled == s.arrived and s.arrived < MOST_FRAMES)
 
 
-@compiled(
-    i8(
-        *(_STATE, i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
-        *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
-        *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], POLLFDS, u8[::1], FRAMES),
-        *(cycle.LEGS, cycle.BOUND),
-        *(
-            cycle.MOTION,
-            cycle.SLIDERS,
-            cycle.BACKLASH_STATES,
-            f8[::1],
-            cycle.FEEDBACKS,
-            f8[:, ::1],
-            types.b1[::1],
-            f8[:, ::1],
-        ),
-        *(cycle.MONITORED, cycle.RECORD, u1[::1]),
-        *(cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
-        *(outputs.OUTPUTS, outputs.PLAN, i8[::1], outputs.LOG),
-    ),
-    releases=True,
-)
-def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
+@compiled()
+def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours, frames: Exchange) -> int:
+    """Wait for the tick, and send the frames at the start of a cycle. Return GO_ON, or the stage that was reached."""
+    s, times = state[0], frames.times
+    s.deadline_ns += s.period_ns
+    if _wait(state, moment, neighbours.pollfds):
+        s.deadline_ns -= s.period_ns
+        s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
+        return Reached.CALLED
+    now, s.listens = _now_ns(state, moment), s.period_ns > SPARE_NS
+    s.marked_ns, s.handled, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0, 0
+    s.lateness_ns = now - s.deadline_ns
+    s.missed = max(0, s.lateness_ns // s.period_ns)
+    t = now / 1e9
+    if (s.missed and s.in_a_row + s.missed > s.allowed) or t >= times[0].due:
+        return Reached.WAITED
+    if not _receive(s, moment, frames, t):
+        return Reached.WAITED
+    s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
+    s.synced, s.handled, s.arrived = t, 0, 0
+    begun, due = send_frames(frames.bus, frames.begin, frames.starts, times), t >= times[0].beat_due
+    first, number = times[0].next_beat, times[0].beats
+    if begun == len(frames.begin) and due:
+        beats, signs = frames.beats[first : first + number], frames.signs[first : first + number]
+        begun += send_frames(frames.bus, beats, signs, times)
+    if begun < len(frames.begin) + number * due:
+        times[0].begun = begun
+        return Reached.SYNCED
+    if due:
+        times[0].beat_due, times[0].next_beat = t + times[0].beat_period, (first + number) % len(frames.beats)
+    begin_cycle(frames.axes, frames.history)
+    _mark(state, moment, Part.SYNC)
+    return GO_ON
+
+
+@compiled()
+def _read(
     state: NDArray[np.void],
     moment: NDArray[np.int64],
-    bus: NDArray[np.int64],
-    arrived: NDArray[np.uint8],
-    arrivals: NDArray[np.uint64],
-    starts: NDArray[np.uint8],
-    begin: NDArray[np.uint64],
-    signs: NDArray[np.uint8],
-    beats: NDArray[np.uint64],
-    setpoints: NDArray[np.uint8],
-    departures: NDArray[np.uint64],
-    pins: NDArray[np.uint8],
-    switchings: NDArray[np.uint64],
-    expected: NDArray[np.void],
-    axes: NDArray[np.void],
-    times: NDArray[np.void],
-    history: Array,
-    pollfds: NDArray[np.int32],
-    hearts: NDArray[np.uint64],
-    batch: NDArray[np.uint8],
-    legs: Array,
-    bounds: NDArray[np.void],
-    motion: Array,
-    sliders: Array,
-    backlash: NDArray[np.void],
-    refused_values: Array,
+    neighbours: Neighbours,
+    frames: Exchange,
     feedback: NDArray[np.void],
-    written: Array,
-    jumps: NDArray[np.bool],
-    scratch: Array,
-    monitored: NDArray[np.void],
-    record: NDArray[np.void],
-    made: NDArray[np.uint8],
-    knots: Array,
-    pieces: Array,
-    tools: Array,
-    law_knots: Array,
-    law_pieces: Array,
-    furthest: Array,
-    switches: NDArray[np.void],
-    planned: NDArray[np.void],
-    words: NDArray[np.int64],
-    log: NDArray[np.void],
+) -> int:
+    """Read the drives' answers into `feedback`. Return GO_ON, or the reached stage if Python must do it."""
+    s, pollfds, hearts, axes = state[0], neighbours.pollfds, neighbours.hearts, frames.axes
+    s.called = called(pollfds)
+    count = hearts[s.gateway_place]  # the same check as in trirail.processes.heartbeats.Watch
+    turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
+    if hearts[URGENT_INDEX] != s.urgent_seen or pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience:
+        return Reached.SYNCED
+    t = _now_ns(state, moment) / 1e9
+    if not (_receive(s, moment, frames, t) and end_read(axes, frames.times, frames.history, t)):
+        return Reached.SYNCED
+    s.handled, s.arrived = 0, 0
+    _mark(state, moment, Part.READ)
+
+    s.overruns += s.missed
+    s.in_a_row = s.in_a_row + s.missed if s.missed else 0
+    s.gateway_seen, s.gateway_turns = count, turns
+    for i in range(3):
+        feedback[0].position[i] = axes[i].position
+        feedback[0].age[i] = axes[i].syncs - axes[i].sampled
+    _mark(state, moment, Part.MODE)
+    return GO_ON
+
+
+@compiled()
+def _solve(
+    state: NDArray[np.void], moment: NDArray[np.int64], frames: Exchange, robot: RobotArrays, motion: MotionArrays
+) -> int:
+    """Evaluate the feedback, and write the next setpoints into their frames. Return GO_ON, or the reached stage."""
+    s = state[0]
+    s.behind = cycle.observe(
+        *(robot.legs, robot.feedback, robot.written, robot.backlash, s.period, s.fastest, s.limit, s.at_rest != 0),
+        *(robot.jumps, robot.scratch, robot.monitored, robot.record),
+    )
+    if s.behind:
+        return Reached.OBSERVED
+    _mark(state, moment, Part.MOTION)
+
+    if s.source == COMMAND:
+        s.time += s.period
+        code = cycle.command(
+            *(robot.legs, robot.bounds, motion.knots, motion.pieces, s.in_sliders != 0, motion.tools),
+            *(motion.law_knots, motion.law_pieces, s.time, s.target),
+            *(motion.furthest, s.course[0], s.course[1], s.course[2]),
+            *(robot.motion, robot.sliders, robot.backlash, robot.refused_values, robot.record),
+        )
+    elif s.source == HOLD:
+        code = cycle.hold(
+            *(robot.legs, robot.bounds, robot.motion, robot.sliders, robot.backlash, robot.refused_values),
+            robot.record,
+        )
+    else:
+        code = 0
+        cycle.follow(
+            *(robot.legs, robot.feedback, robot.jumps, s.held != 0, False, s.step),
+            *(robot.motion, robot.sliders, robot.backlash, robot.record),
+        )
+    monitored = robot.monitored[0]
+    in_position = s.settles and (monitored.inside >= monitored.dwell or s.cycle + 1 >= s.timeout)
+    s.called, s.code = in_position or s.called or code != s.code or s.cycle + 1 >= s.due, code
+    late = _now_ns(state, moment) / 1e9 - s.synced > s.period
+    if code >> 2 != 0 or late or not set_frames(frames.setpoints, frames.axes, robot.sliders[0]):
+        return Reached.SOLVED
+    return GO_ON
+
+
+@compiled()
+def _switch_outputs(
+    s: Any, axes: NDArray[np.void], record: NDArray[np.void], motion: MotionArrays, tables: OutputArrays
+) -> bool:
+    """Switch the outputs that are due with the setpoints. Return False, and change nothing, if Python must do it."""
+    if len(tables.switches) == 0:
+        return True
+    if needs_python(axes, tables.words):
+        return False
+    if s.logged == 0:
+        s.report_due = s.cycle + s.report_after
+    s.logged = outputs.switch(
+        *(tables.switches, tables.planned, tables.words, tables.log, s.logged, motion.law_knots, motion.law_pieces),
+        *(s.source == COMMAND, s.time, s.period, s.cycle + 1, s.deadline_ns, record),
+    )
+    s.called |= s.logged >= outputs.TABLE_LENGTH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
+    for i in range(3):
+        axes[i].outputs = record[0].outputs[i] = tables.words[i]
+    return True
+
+
+@compiled()
+def _record(s: Any, robot: RobotArrays, batch: NDArray[np.uint8]) -> None:
+    """Complete the record of the cycle, and append it to the batch."""
+    row = robot.record[0]
+    s.cycle += 1
+    row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
+    row.parts_ns[:] = s.parts_ns
+    s.parts_ns[Part.DECIDE] = 0
+    row.mode = s.mode
+    batch[s.batched] = robot.packed
+    s.batched += 1
+
+
+@compiled(i8(_STATE, i8[::1], _NEIGHBOURS, _EXCHANGE, _ROBOT, _MOTION, _OUTPUTS), releases=True)
+def run(
+    state: NDArray[np.void],
+    moment: NDArray[np.int64],
+    neighbours: Neighbours,
+    frames: Exchange,
+    robot: RobotArrays,
+    motion: MotionArrays,
+    tables: OutputArrays,
 ) -> int:
     """Run cycles until Python is needed; return the stage that the newest cycle has reached, as a number of Reached.
-
-    The parameters that are not listed here are the same as in control.cycle and cycle_frames.
 
     Parameters
     ----------
     moment : (2,)
         Memory for a struct timespec.
-    bus : (3,)
-        BusAccess of the bus.
-    pins, switchings
-        Frames for the outputs of the drives, and the headers of these frames.
-    pollfds : (n, 2)
-        Array of struct pollfd, of which the first is that of the gateway.
-    hearts
-        Counters of trirail.processes.heartbeats.
-    batch : (n, SIZE)
-        Memory for packed records.
-    made : (SIZE,)
-        Bytes of `record`.
-    switches, planned, words, log
-        Tables of outputs, the same as in control.outputs.switch.
+    tables
+        Tables of outputs; empty if the robot has no outputs.
 
     """
-    s, row = state[0], record[0]
-    while s.cycle < s.until and s.batched < len(batch):
-        s.deadline_ns += s.period_ns
-        if _wait(state, moment, pollfds):
-            s.deadline_ns -= s.period_ns
-            s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
-            return Reached.CALLED
-        now, s.listens = _now_ns(state, moment), s.period_ns > SPARE_NS
-        s.marked_ns, s.handled, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0, 0
-        s.lateness_ns = now - s.deadline_ns
-        s.missed = max(0, s.lateness_ns // s.period_ns)
-        t = now / 1e9
-        if (s.missed and s.in_a_row + s.missed > s.allowed) or t >= times[0].due:
-            return Reached.WAITED
-        if not _receive(s, bus, arrivals, arrived, moment, expected, axes, times, t):
-            return Reached.WAITED
-        s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
-        s.synced, s.handled, s.arrived = t, 0, 0
-        begun, due = send_frames(bus, begin, starts, times), t >= times[0].beat_due
-        first, number = times[0].next_beat, times[0].beats
-        if begun == len(begin) and due:
-            begun += send_frames(bus, beats[first : first + number], signs[first : first + number], times)
-        if begun < len(begin) + number * due:
-            times[0].begun = begun
-            return Reached.SYNCED
-        if due:
-            times[0].beat_due, times[0].next_beat = t + times[0].beat_period, (first + number) % len(beats)
-        begin_cycle(axes, history)
-        _mark(state, moment, Part.SYNC)
-
-        called_now = called(pollfds)
-        count = hearts[s.gateway_place]  # the same check as in trirail.processes.heartbeats.Watch
-        turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
-        if hearts[URGENT_INDEX] != s.urgent_seen or pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience:
-            return Reached.SYNCED
-        t = _now_ns(state, moment) / 1e9
-        if not (
-            _receive(s, bus, arrivals, arrived, moment, expected, axes, times, t) and end_read(axes, times, history, t)
-        ):
-            return Reached.SYNCED
-        s.handled, s.arrived = 0, 0
-        _mark(state, moment, Part.READ)
-
-        s.overruns += s.missed
-        s.in_a_row = s.in_a_row + s.missed if s.missed else 0
-        s.gateway_seen, s.gateway_turns = count, turns
-        for i in range(3):
-            feedback[0].position[i] = axes[i].position
-            feedback[0].age[i] = axes[i].syncs - axes[i].sampled
-        _mark(state, moment, Part.MODE)
-        s.behind = cycle.observe(
-            *(legs, feedback, written, backlash, s.period, s.fastest, s.limit, s.at_rest != 0),
-            *(jumps, scratch, monitored, record),
-        )
-        if s.behind:
-            return Reached.OBSERVED
-        _mark(state, moment, Part.MOTION)
-
-        if s.source == COMMAND:
-            s.time += s.period
-            code = cycle.command(
-                *(legs, bounds, knots, pieces, s.in_sliders != 0, tools, law_knots, law_pieces, s.time, s.target),
-                *(furthest, s.course[0], s.course[1], s.course[2], motion, sliders, backlash, refused_values, record),
-            )
-        elif s.source == HOLD:
-            code = cycle.hold(legs, bounds, motion, sliders, backlash, refused_values, record)
-        else:
-            code = 0
-            cycle.follow(legs, feedback, jumps, s.held != 0, False, s.step, motion, sliders, backlash, record)
-        in_position = s.settles and (monitored[0].inside >= monitored[0].dwell or s.cycle + 1 >= s.timeout)
-        s.called, s.code = in_position or called_now or code != s.code or s.cycle + 1 >= s.due, code
-        late = _now_ns(state, moment) / 1e9 - s.synced > s.period
-        if code >> 2 != 0 or late or not set_frames(setpoints, axes, sliders[0]):
+    s = state[0]
+    while s.cycle < s.until and s.batched < len(neighbours.batch):
+        reached = _begin(state, moment, neighbours, frames)
+        if reached == GO_ON:
+            reached = _read(state, moment, neighbours, frames, robot.feedback)
+        if reached == GO_ON:
+            reached = _solve(state, moment, frames, robot, motion)
+        if reached != GO_ON:
+            return reached
+        if not _switch_outputs(s, frames.axes, robot.record, motion, tables):
             return Reached.SOLVED
-        if len(switches) and needs_python(axes, words):
-            return Reached.SOLVED
-        if len(switches):
-            if s.logged == 0:
-                s.report_due = s.cycle + s.report_after
-            s.logged = outputs.switch(
-                *(switches, planned, words, log, s.logged, law_knots, law_pieces, s.source == COMMAND),
-                *(s.time, s.period, s.cycle + 1, s.deadline_ns, record),
-            )
-            s.called |= s.logged >= outputs.TABLE_LENGTH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
-            for i in range(3):
-                axes[i].outputs = row.outputs[i] = words[i]
         _mark(state, moment, Part.KINEMATICS)
-
-        s.sent = send_frames(bus, departures, setpoints, times)
-        accepted = s.sent == len(departures) and send_outputs(bus, switchings, pins, axes, times)
+        s.sent = send_frames(frames.bus, frames.departures, frames.setpoints, frames.times)
+        accepted = s.sent == len(frames.departures) and send_outputs(
+            frames.bus, frames.switchings, frames.pins, frames.axes, frames.times
+        )
         _mark(state, moment, Part.WRITE)
-
-        s.cycle += 1
-        row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
-        row.parts_ns[:] = s.parts_ns
-        s.parts_ns[Part.DECIDE] = 0
-        row.mode = s.mode
-        batch[s.batched] = made
-        s.batched += 1
+        _record(s, robot, neighbours.batch)
         _mark(state, moment, Part.RECORD)
         if not accepted:
             return Reached.WRITTEN

@@ -86,7 +86,6 @@ class QuietCycles:
         """Arguments of the compiled function, valid until the drives lend other tables or the motion changes."""
         self._nothing = np.zeros(1)
         measured, setpoints = control.measured, control.setpoints
-        self._made = measured.record.view(np.uint8)
         state = self._state[0]
         self.parts_ns: MutableSequence[int] = state["parts_ns"]
         """Durations of the parts of the newest cycle [ns], in the memory to which compiled code writes."""
@@ -193,23 +192,24 @@ class QuietCycles:
     def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
         """Return the arguments of the compiled function that stay the same while the drives lend their tables."""
         measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
-        return (
-            *(self._state, self._moment, lent.bus),
-            *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
+        frames = quiet.Exchange(
+            *(lent.bus, lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
-            *(lent.outputs.frames, lent.outputs.headers),
-            *(lent.expected, lent.axes, lent.times, lent.history),
-            *(self._poll_set.pollfds, self._hearts, self._reports.batch, measured.legs, setpoints.bounds),
-            *(schedule.motion, setpoints.sliders, measured.backlash, setpoints.refused_values),
-            *(measured.numbers, measured.written, measured.jumping, measured.scratch),
-            *(measured.settling.monitored, measured.record, self._made),
+            *(lent.outputs.frames, lent.outputs.headers, lent.expected, lent.axes, lent.times, lent.history),
         )
+        robot = quiet.RobotArrays(
+            *(measured.legs, setpoints.bounds, schedule.motion, setpoints.sliders, measured.backlash),
+            *(setpoints.refused_values, measured.numbers, measured.written, measured.jumping, measured.scratch),
+            *(measured.settling.monitored, measured.record, measured.record.view(np.uint8)),
+        )
+        neighbours = quiet.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
+        return self._state, self._moment, neighbours, frames, robot
 
-    def _motion_arguments(self, run: Run | None) -> tuple[Any, ...]:
+    def _motion_arguments(self, run: Run | None) -> tuple[quiet.MotionArrays, quiet.OutputArrays]:
         """Return the arguments of the compiled function that depend on the motion."""
         path, law = (run.path, run.law) if run is not None else (_EMPTY_PATH, _IDLE_LAW)
         furthest = run.furthest if run is not None else self._nothing
         outputs = self._control.outputs
         outputs.prepare(run, self._control.schedule.version)
-        switches = outputs.state, outputs.planned, outputs.words, outputs.log
-        return path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest, *switches
+        motion = quiet.MotionArrays(path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest)
+        return motion, quiet.OutputArrays(outputs.state, outputs.planned, outputs.words, outputs.log)
