@@ -129,9 +129,10 @@ def doctor(
     quick: Annotated[bool, Flag] = False,
     json: Annotated[bool, Flag] = False,
 ) -> int:
-    """Check this machine and a configuration, or a CAN interface with the shipped configuration for SocketCAN.
+    """Check this machine and a configuration, or a CAN interface.
 
-    Exit 1 only if a problem would prevent the robot from running.
+    Exit 1 only if a problem would prevent the robot from running. A CAN interface is checked with the shipped
+    configuration for SocketCAN.
 
     For ten seconds, the command runs cycles that only exchange frames, to measure which rates this machine can hold.
     On SocketCAN, it then measures for five seconds when the frames of cycles are on the bus: those of a running

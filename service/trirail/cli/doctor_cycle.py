@@ -99,21 +99,21 @@ def on_bus(timing: BusTiming | str, config: Config) -> list[Check]:
         return [Check(name, "ok", f"not measured: {timing}")] if timing else []
     period, error = 1e6 / timing.rate_hz, timing.interval_error_us
     sender = "the running service" if timing.source == "service" else "test frames, which no drive uses"
-    found = (
+    finding = (
         f"{timing.timestamps} loopback timestamps, {timing.syncs} SYNCs of {sender} at {_frequency(timing.rate_hz)}: "
         f"SYNC off its period p50 {error.p50:.0f}, p99 {error.p99:.0f}, p99.9 {error.p999:.0f}, "
         f"worst {error.max:.0f} µs"
     )
     if timing.setpoints_us is None:
-        return [Check(name, "warning", f"{found}; no setpoints were sent", "see the faults in trirail status")]
+        return [Check(name, "warning", f"{finding}; no setpoints were sent", "see the faults in trirail status")]
     last = timing.setpoints_us
     p50, p999, worst = (f"{value / period:.0%}" for value in (last.p50, last.p999, last.max))
-    found = f"{found}; last setpoint p50 {p50}, p99.9 {p999}, worst {worst} of the period after SYNC"
+    finding = f"{finding}; last setpoint p50 {p50}, p99.9 {p999}, worst {worst} of the period after SYNC"
     if timing.without_setpoints:
         lacking = f"{timing.without_setpoints} cycles without a setpoint before the next SYNC"
         remedy = "see the lines above; end other programs, isolate a processor, or set a lower loop.rate_hz"
-        return [Check(name, "warning", f"{found}; {lacking}", remedy)]
-    return [Check(name, "ok", found)]
+        return [Check(name, "warning", f"{finding}; {lacking}", remedy)]
+    return [Check(name, "ok", finding)]
 
 
 def _frequency(hertz: int) -> str:

@@ -149,7 +149,7 @@ def measure(
 
 
 def _why_not_idle(heard: Sequence[StampedFrame], bitrate: int, sync: int | None) -> str:
-    """Return why test frames must not be sent after these frames were heard for WAITING_S, or ""."""
+    """Return why test frames must not be sent after these frames arrived within WAITING_S, or ""."""
     if sync is not None and any(_is_sync(frame, sync) for frame in heard):
         return "another node sends SYNC, so no test frames were sent"
     load = sum(frame_bits(len(frame.data)) for frame in heard) / WAITING_S / bitrate
