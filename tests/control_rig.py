@@ -47,7 +47,7 @@ def expected_duration(answer: Answer) -> float:
 class PerfectDrives:
     """Drives that are at once where they were told to be two SYNCs ago, and power up and down within a cycle."""
 
-    bus_load = 0.0
+    bus_load = next_sync = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
     traffic = 0
     reported_faults: tuple[DriveFault | None, ...] = (None, None, None)

@@ -6,6 +6,7 @@ The check has its own tables of the standards, and shares no code with the drive
 from __future__ import annotations
 
 import itertools
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 from can import CanutilsLogReader
 from trirail.config import Config
+from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.config import Drive
 from trirail_drivers.interface import NAMES
@@ -22,6 +24,8 @@ HELD = {
     "setpoints": "one per drive and SYNC, within the limits, without a step in position, velocity or acceleration",
     "power": "controlwords and states in CiA 402's order, each state asked for, no power without a setpoint",
     "order": "SDO requests follow the setpoints of their cycle, except controlwords that stop a drive",
+    "gap": "the service sends nothing in the frame time before a tick, except in a cycle with late setpoints, and "
+    "controlwords for a quick stop",
     "capture": "the service's own log has the same frames in the same order",
 }
 """Properties that are proved if `problems` and `differences` find nothing."""
@@ -58,6 +62,11 @@ ASKED_BY = {
 }
 """Controlwords that command each transition of CiA 402; None for a transition that a drive makes by itself."""
 
+MAX_FRAME_BITS = frame_bits(8)
+"""Worst-case length of a frame [bits]: 135 µs at 1 Mbit/s."""
+GRID_TOLERANCE = 1e-3
+"""Rounding of timestamps and of the grid of ticks, as a fraction of the period."""
+
 ALLOWED_PREDECESSORS = {0x07: {0x06, 0x0F}, 0x0F: {0x07}}
 """Controlwords that may precede each of these controlwords during a power-up."""
 
@@ -92,6 +101,7 @@ def problems(log: Sequence[Frame], config: Config, missed: int, until: float) ->
     """Return the errors in the frames before the time `until`, one line each; `missed` ticks were reported missing."""
     log = [frame for frame in log if frame.t < until]
     lines = [*sync_problems(log, config.period, missed, until), *order_problems(log)]
+    lines += gap_problems(log, config.period, config.can.bitrate, config.drives.master_node)
     for name, drive in zip(NAMES, config.drives.each, strict=True):
         lines += (f"drive {name}: {problem}" for problem in _setpoint_problems(log, drive, config))
         lines += (f"drive {name}: {problem}" for problem in _power_problems(log, drive.node))
@@ -178,6 +188,66 @@ def order_problems(log: Sequence[Frame]) -> Iterator[str]:
         elif service == layout.RPDO2 and request is not None:
             yield f"SDO request {request.data.hex()} precedes a setpoint of its cycle, at {request.t:.6f}"
             request = None
+
+
+def gap_problems(log: Sequence[Frame], period: float, bitrate: int, master: int) -> Iterator[str]:
+    """Yield the service's frames that are sent in the frame time before a tick, or after it and before its SYNC.
+
+    Such a frame can still be on the bus at the time of the SYNC, and would delay it. The ticks are not in the log: each
+    SYNC is late by an unknown time, so the grid of the period begins with the SYNC that is earliest in its period. A
+    cycle with setpoints that are sent so late is late as a whole, and the service counts its setpoints.
+
+    Parameters
+    ----------
+    period
+        Period [s].
+    bitrate
+        Bit rate [bit/s].
+    master
+        Node id of the service.
+
+    """
+    syncs = [frame.t for frame in log if frame.identifier == layout.SYNC]
+    if not syncs:
+        return
+    began = syncs[0]
+    began += min(t - began - round((t - began) / period) * period for t in syncs)
+    frame_time = MAX_FRAME_BITS / bitrate
+    for cycle in _cycles(log):
+        number = math.floor((cycle[0].t - began) / period + GRID_TOLERANCE)
+        latest = began + (number + 1) * period - frame_time
+        if any(frame.identifier & ~0x7F == layout.RPDO2 and frame.t > latest for frame in cycle):
+            continue
+        for frame in cycle:
+            if frame.t > latest and _is_of_service(frame, master) and not _stops(frame):
+                early = (latest + frame_time - frame.t) * 1e6
+                yield f"frame {frame.identifier:03X} is sent {early:.0f} µs before the next tick, at {frame.t:.6f}"
+
+
+def _cycles(log: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+    """Yield the frames of each cycle that the log contains completely: its SYNC and the frames before the next SYNC."""
+    at = [number for number, frame in enumerate(log) if frame.identifier == layout.SYNC]
+    for first, end in itertools.pairwise(at):
+        yield log[first:end]
+
+
+def _is_of_service(frame: Frame, master: int) -> bool:
+    """Return whether the service sends frames with this identifier: NMT, RPDOs, SDO requests and its heartbeat."""
+    service, node = frame.identifier & ~0x7F, frame.identifier & 0x7F
+    rpdos = (layout.RPDO1, layout.RPDO2, layout.RPDO3, layout.RPDO3 + 0x100)
+    return (
+        frame.identifier == layout.NMT
+        or service in {*rpdos, layout.SDO_REQUEST}
+        or (service == layout.HEARTBEAT and node == master)
+    )
+
+
+def _stops(frame: Frame) -> bool:
+    """Return whether a frame is a controlword that stops a drive in motion."""
+    by_pdo = frame.identifier & ~0x7F == layout.RPDO1 and len(frame.data) == layout.CONTROLWORD.size
+    by_sdo = frame.identifier & ~0x7F == layout.SDO_REQUEST and frame.data.startswith(layout.CONTROLWORD_DOWNLOAD)
+    word = frame.data if by_pdo else frame.data[4:6] if by_sdo else b"\xff\xff"
+    return word == layout.CONTROLWORD.pack(layout.QUICK_STOP)
 
 
 def _setpoints(log: Sequence[Frame], drive: Drive) -> list[Setpoint]:

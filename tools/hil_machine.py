@@ -24,7 +24,7 @@ PORTABLE = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 would also take minutes to compile itself.
 """
 
-TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py")
+TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py", "tests/diagnosis/test_bus_timing.py")
 """Files with tests marked vcan."""
 
 COMPILED = "compiled"

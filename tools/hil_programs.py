@@ -104,6 +104,19 @@ class Machine:
 
         return verdict
 
+    def measured_timing(self) -> str:
+        """Run `trirail doctor can0` while the service runs, and return its finding on the timing of the bus.
+
+        Raises Failed unless the frames of the service were measured.
+        """
+        command = (sys.executable, "-P", "-m", "trirail", "doctor", "can0", "--json")
+        done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, timeout=STEP_TIMEOUT_S, check=False)
+        answer = json.loads(done.stdout)
+        (check,) = [check for check in answer["checks"] if check["name"] == "can0 timing"]
+        if answer["bus"] is None or answer["bus"]["source"] != "service" or answer["bus"]["setpoints_us"] is None:
+            raise Failed(f"the doctor says of the service's frames: {check}")
+        return str(check["found"])
+
     def candump(self, channel: str, name: str) -> None:
         """Start to log all frames on an interface to the file `name` in memory."""
         with (self._memory / name).open("wb") as log:

@@ -43,6 +43,8 @@ def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, An
         result["loops"] |= {f"{config.loop.rate_hz} Hz": loop_of(robot.state())}
         result["cut"] = time.time()
         robot.enable()
+        held("doctor beside the service", machine.measured_timing())
+        recover(robot)
         quick_stopped(robot, held)
         _flooded(robot, held)
         _thrown_out(robot, held)

@@ -139,6 +139,11 @@ class DriveGroup(Protocol):
     raise; an error becomes a fault in the next feedback.
     """
 
+    next_sync: float
+    """Time of the drives' clock at which the next `sync` is due [s], set before commands between two cycles; inf if the
+    time is unknown. Frames of `disable` and `reset` that would delay this `sync` are sent by the next `write`. Those of
+    `quick_stop` are never held back.
+    """
     bus_load: float
     """Fraction of the bus capacity that cyclic and periodic frames use with worst-case bit stuffing; 1.0 is a full bus.
     """

@@ -20,7 +20,9 @@ from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import SIM, Config, Tls, everything, load
 from trirail.diagnosis import Check, bare_loop, drive_checks
 from trirail.diagnosis.bare_loop import Cycles
+from trirail.diagnosis.bus_timing import BusTiming
 from trirail.errors import ServiceError
+from trirail.wire.state import Percentiles
 from trirail_drivers.bus.frames import bits_of, frame_bits
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError
@@ -399,6 +401,77 @@ def test_the_governor_of_every_processor_is_read(tmp_path: Path, monkeypatch: py
     assert check.remedy == "cpupower frequency-set --governor performance"
 
 
+TIMING = BusTiming(
+    source="service",
+    timestamps="hardware",
+    rate_hz=500,
+    syncs=2500,
+    interval_error_us=Percentiles(1.0, 2.0, 3.0, 4.0),
+    setpoints_us=Percentiles(400.0, 500.0, 600.0, 1000.0),
+    without_setpoints=0,
+)
+
+
+def test_the_timing_on_the_bus_is_a_share_of_the_period() -> None:
+    checks = doctor.examine(REAL, msgspec.structs.replace(GOOD, bus_timing=TIMING))
+    (check,) = [each for each in checks if each.name == "can0 timing"]
+    assert check == Check(
+        "can0 timing",
+        "ok",
+        "hardware loopback timestamps, 2500 SYNCs of the running service at 500 Hz: SYNC off its period p50 1, p99 2, "
+        "p99.9 3, worst 4 µs; last setpoint p50 20%, p99.9 30%, worst 50% of the period after SYNC",
+    )
+
+
+@pytest.mark.parametrize(
+    ("timing", "verdict", "said"),
+    [
+        ("", None, ""),
+        ("Network is down", "ok", "not measured: Network is down"),
+        (msgspec.structs.replace(TIMING, without_setpoints=3), "warning", "3 cycles without a setpoint"),
+        (msgspec.structs.replace(TIMING, setpoints_us=None), "warning", "no setpoints were sent"),
+        (msgspec.structs.replace(TIMING, source="test frames"), "ok", "SYNCs of test frames, which no drive uses"),
+    ],
+)
+def test_what_the_timing_on_the_bus_lacks_is_told(timing: BusTiming | str, verdict: str | None, said: str) -> None:
+    checks = doctor_cycle.on_bus(timing, REAL)
+    assert [check.verdict for check in checks] == ([verdict] if verdict else [])
+    assert all(said in check.found for check in checks)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [({}, ""), ({"bitrate": 500_000}, "bit rate"), ({"state": "ERROR-PASSIVE"}, "not error-active")],
+)
+def test_nothing_is_sent_on_an_interface_that_would_disturb_its_bus(changes: dict[str, Any], reason: str) -> None:
+    found = probes.unfit(link(**changes), 1_000_000)
+    assert reason in found
+    assert bool(found) == bool(reason)
+    assert probes.unfit({"linkinfo": {"info_kind": "vcan"}}, 1_000_000) == ""
+
+
+def test_the_bus_is_measured_only_if_it_is_up_and_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "loop_on", lambda cpu: 7)
+    monkeypatch.setattr(probes, "measure_bus", lambda *_: TIMING)
+    config = changed(REAL, "loop", realtime="off", cpu=1)
+    for report, quick, measured in ((LINK, False, TIMING), (LINK, True, ""), (link(flags=["NOARP"]), False, "")):
+        monkeypatch.setattr(probes, "link", lambda name, report=report: report)
+        assert probes.machine(config, quick=quick).bus_timing == measured
+
+
+def test_an_interface_stands_for_the_shipped_configuration_on_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(probes, "link", lambda name: link(bitrate=250_000))
+    assert all(probes.is_interface(Path(name)) for name in ("can0", "vcan12", "slcan1"))
+    assert not any(probes.is_interface(Path(name)) for name in ("can0.toml", "robot.toml", "can", "x/can0"))
+    config = probes.on_interface(REAL, "can3")
+    assert (config.can.interface, config.can.channel, config.can.bitrate) == ("socketcan", "can3", 250_000)
+    (tmp_path / "can0").write_text("")
+    assert not probes.is_interface(Path("can0"))
+
+
 def test_a_loop_on_the_same_processor_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probes, "PROCESSES", tmp_path)
     for pid, called, allowed in ((7, "trirail: loop", "2-3"), (8, "trirail: planner", "1"), (9, "sh", "0-3")):
@@ -432,6 +505,7 @@ def test_the_command(json_wanted: bool) -> None:
         said = json.loads(done.stdout)
         verdicts = {check["name"]: check["verdict"] for check in said["checks"]}
         assert verdicts["CAN"] == "ok"
+        assert said["bus"] is None
         if said["cycle"] is not None:  # another service may run here
             assert said["cycle"]["rate_hz"] == 1000
             assert said["cycle"]["cycles"] == 10_000

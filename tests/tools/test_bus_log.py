@@ -155,3 +155,62 @@ def test_a_request_before_a_setpoint_of_its_cycle_is_noticed(data: bytes, notice
     assert any("precedes a setpoint" in line for line in problems([*GOOD[:at], request, *GOOD[at:]])) == noticed
     end = next(number for number, frame in enumerate(GOOD[at:], at) if frame.identifier == layout.SYNC)
     assert not any("precedes" in line for line in problems([*GOOD[:end], request, *GOOD[end:]]))
+
+
+def with_frame(identifier: int, data: bytes, t: float) -> list[Frame]:
+    return sorted([*GOOD, Frame(t, identifier, data)], key=lambda frame: frame.t)
+
+
+def gaps(log: list[Frame]) -> list[str]:
+    return list(bus_log.gap_problems(log, PERIOD, CONFIG.can.bitrate, CONFIG.drives.master_node))
+
+
+BEFORE = 1.0 + 20 * PERIOD
+"""A tick."""
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "noticed"),
+    [
+        (layout.SDO_REQUEST + 1, layout.STATUSWORD_UPLOAD, True),
+        (layout.RPDO1 + 2, layout.CONTROLWORD.pack(layout.DISABLE_VOLTAGE), True),
+        (layout.RPDO1 + 2, layout.CONTROLWORD.pack(layout.QUICK_STOP), False),
+        (layout.SDO_REQUEST + 2, layout.CONTROLWORD_DOWNLOAD + b"\2\0\0\0", False),
+        (layout.SDO_REQUEST + 2, layout.CONTROLWORD_DOWNLOAD + b"\0\0\0\0", True),
+        (layout.NMT, bytes((layout.NMT_START, 1)), True),
+        (layout.RPDO3 + 1, bytes(4), True),
+        (layout.HEARTBEAT + CONFIG.drives.master_node, b"\5", True),
+        (layout.HEARTBEAT + 1, b"\5", False),
+        (layout.TPDO2 + 1, bytes(4), False),
+    ],
+)
+def test_a_frame_of_the_service_that_would_delay_a_sync_is_noticed(identifier: int, data: bytes, noticed: bool) -> None:
+    assert gaps(GOOD) == []
+    assert len(gaps(with_frame(identifier, data, BEFORE - 1.3e-4))) == noticed
+    assert gaps(with_frame(identifier, data, BEFORE - 1.4e-4)) == []
+
+
+def delayed(late: float) -> list[Frame]:
+    """The right log, with one SYNC that is late, and its cycle with it."""
+    return [each._replace(t=each.t + late) if BEFORE <= each.t < BEFORE + PERIOD / 2 else each for each in GOOD]
+
+
+def test_a_late_tick_excuses_no_frame_before_its_sync() -> None:
+    log = [*delayed(3e-4), Frame(BEFORE + 1e-4, layout.SDO_REQUEST + 1, layout.STATUSWORD_UPLOAD)]
+    assert len(gaps(sorted(log, key=lambda frame: frame.t))) == 1
+    assert gaps(delayed(3e-4)) == []
+
+
+def test_a_cycle_with_late_setpoints_is_no_gap_that_was_missed() -> None:
+    late = [
+        each._replace(t=BEFORE - 5e-5) if each.identifier == layout.RPDO2 + 3 and 0 < BEFORE - each.t < PERIOD else each
+        for each in GOOD
+    ]
+    request = Frame(BEFORE - 4e-5, layout.SDO_REQUEST + 1, layout.STATUSWORD_UPLOAD)
+    assert gaps(sorted([*late, request], key=lambda frame: frame.t)) == []
+
+
+def test_the_frame_time_is_that_of_the_bit_rate() -> None:
+    log = with_frame(layout.SDO_REQUEST + 1, layout.STATUSWORD_UPLOAD, BEFORE - 2e-4)
+    assert gaps(log) == []
+    assert list(bus_log.gap_problems(log, PERIOD, 500_000, CONFIG.drives.master_node))

@@ -90,6 +90,8 @@ class Cia402Axis(Axis):
         """Time of the next statusword request, and time until which the error register may arrive [s]."""
         self.register_wanted = False
         """Whether the drive's error register 1001h must be requested."""
+        self.start_wanted = False
+        """Whether the drive must be switched to NMT operational, after a reset."""
         self._operational = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
         self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfterStop()
@@ -121,7 +123,7 @@ class Cia402Axis(Axis):
     def rejoin(self, exchange: process_data.Exchange, units: Units, now: float, *, homed: bool) -> None:
         """Let the drive take part in the cycle again after a set-up in the background."""
         self.set_up(exchange, units)
-        self.restarted = self.silent = self.left_operational = self.pdo_silent = False
+        self.restarted = self.silent = self.left_operational = self.pdo_silent = self.start_wanted = False
         self.stopped = self._operational = False
         self.powered_up = self.has_followed = self._followed = self.has_setpoint = False
         self.mode.shown, self.cyclic, self.follows, self.held, self.mode_bits = exchange.mode_shown, True, True, None, 0
@@ -174,7 +176,7 @@ class Cia402Axis(Axis):
         settled = self.state is wanted and wanted is not PowerState.QUICK_STOP_ACTIVE
         no_fault = self.event is None and not self.error_code and self.reset_until == -math.inf
         lives = self._operational and not (
-            self.stopped or self.left_operational or self.pdo_silent or self.register_wanted
+            self.stopped or self.left_operational or self.pdo_silent or self.register_wanted or self.start_wanted
         )
         asked = self.sdo_asked is not None or self.exchange.polled or self.awaits_mode
         follows = wanted is PowerState.OPERATION_ENABLED and self.exchange.tells_following

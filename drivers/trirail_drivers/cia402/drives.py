@@ -223,6 +223,7 @@ class Cia402(Driver[Cia402Axis]):
 
     def _write_setpoints(self, position: Triple, velocity: Triple) -> None:
         late = self._clock() - self._synced > self._period
+        self._start_nodes()
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._command()  # if frames have to wait, stop commands are sent first
         for axis, frame, metres, rate in zip(self._axes, self._setpoints, position, velocity, strict=True):
@@ -246,6 +247,7 @@ class Cia402(Driver[Cia402Axis]):
                 axis.setpoints_lost += 1
             elif late:
                 axis.setpoints_late += 1
+        self._ask_for_registers()
         self._command()
         self._recover()
 
@@ -366,7 +368,8 @@ class Cia402(Driver[Cia402Axis]):
         A drive that still has power after `stop_timeout` latches a fault with cause "timeout".
         """
         self._power_off(PowerState.SWITCH_ON_DISABLED, "disable")
-        self._command()
+        if self._leaves_room(len(self._axes)):
+            self._command()
 
     def quick_stop(self) -> None:
         """Begin the quick-stop ramp of every drive in this cycle. Each drive removes its power when its ramp ends.
@@ -390,14 +393,26 @@ class Cia402(Driver[Cia402Axis]):
         for axis in self._axes:
             if not axis.configured:
                 continue
-            if axis.left_operational:  # the set-up is still valid: only a restarted drive needs a new one
+            axis.start_wanted |= axis.left_operational
+            axis.clear_faults(now)
+        if self._leaves_room(len(self._axes) + sum(axis.start_wanted + axis.register_wanted for axis in self._axes)):
+            self._start_nodes()
+            self._ask_for_registers()
+            self._command()
+
+    def _start_nodes(self) -> None:
+        """Start the nodes that a reset returns to NMT operational. Only then do they receive controlwords by PDO."""
+        for axis in self._axes:
+            if axis.start_wanted:  # the set-up is still valid: only a restarted drive needs a new one
+                axis.start_wanted = False
                 self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
                 axis.outputs_sent = NOTHING_SENT  # the drive may have missed outputs, or changed them by itself
-            axis.clear_faults(now)
+
+    def _ask_for_registers(self) -> None:
+        for axis in self._axes:
             if axis.register_wanted:
                 axis.register_wanted = False
                 self._ask(axis, canopen_frames.ERROR_REGISTER_UPLOAD)
-        self._command()
 
     def _cut_power(self) -> None:
         # By PDO and by SDO: an operational node receives both, a pre-operational node only the SDO (CiA 301).

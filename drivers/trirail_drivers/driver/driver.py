@@ -12,6 +12,7 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.bus import load
+from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import NO_IO, DigitalIo
@@ -61,6 +62,7 @@ class Driver(ABC, Generic[AnyAxis]):
             each.assign_io(digital)
         self._recovery: Recovery[AnyAxis, Any, Any] | None = None
         self._period = 0.0
+        self.next_sync = math.inf
         self._synced = 0.0
         """Start of the cycle [s]."""
         self._off_deadline = math.inf
@@ -117,6 +119,9 @@ class Driver(ABC, Generic[AnyAxis]):
         It also continues while a reopened bus is on trial, since some drives send frames only in answer to requests.
         """
         if self._recovery is None:
+            return
+        # In a late cycle, a request would delay the next SYNC. The setpoints before it may still be in the queue.
+        if self._clock() + self._duration(len(self._axes) + 1) > self._synced + self._period:
             return
         if self._wire.carries:
             self._recovery.step(self._synced, stopping=self._off_deadline != math.inf)
@@ -205,10 +210,19 @@ class Driver(ABC, Generic[AnyAxis]):
         if warning := load.warning(rate, self.bus_load):
             self._wire.warn(warning)
 
+    def _duration(self, frames: int) -> float:
+        """Return the longest time for which this number of frames is on the bus [s]."""
+        return frames * frame_bits(8) / self._bitrate
+
+    def _leaves_room(self, frames: int) -> bool:
+        """Return True if this number of frames will not delay the next SYNC, as far as its time is known."""
+        return self._clock() + self._duration(frames) <= self.next_sync
+
     def _begin_cycle(self, now: float) -> None:
         """Begin a cycle on the bus, and store the access to the bus in the tables, since the bus may be a new one."""
         self._wire.begin(now, stopping=self._off_deadline != math.inf)
         self._tables.bus[:] = self._wire.access
+        self.next_sync = math.inf
 
     @property
     def _unready(self) -> UnreadyDrives:

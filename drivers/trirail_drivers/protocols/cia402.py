@@ -69,6 +69,8 @@ CIA402 = Protocol(
     protections={name: describe_protection(name) for name in PROTECTIONS},
     without_io="",
     states=lambda node: {canopen_frames.TPDO1 + node, canopen_frames.TPDO2 + node},
+    sync=canopen_frames.SYNC,
+    setpoints=range(canopen_frames.RPDO1, canopen_frames.SDO_ANSWER),  # a drive may use any of its RPDOs
     fault_frames={
         "nmt": Frames(True, canopen_frames.NMT),
         "sync": Frames(True, canopen_frames.SYNC),

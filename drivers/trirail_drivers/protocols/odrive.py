@@ -49,6 +49,8 @@ ODRIVE = Protocol(
         cansimple.identifier(node, cansimple.HEARTBEAT),
         cansimple.identifier(node, cansimple.GET_ENCODER_ESTIMATES),
     },
+    sync=None,
+    setpoints=range(0),
     fault_frames={  # named as in the manual
         "set_axis_state": Frames(True, cansimple.SET_AXIS_STATE, _NODE),
         "set_controller_mode": Frames(True, cansimple.SET_CONTROLLER_MODE, _NODE),

@@ -63,5 +63,9 @@ class Protocol:
     """Reason why the drives have no digital outputs and inputs in the cycle; "" if they have them."""
     states: Callable[[int], set[int]]
     """Function that returns the CAN identifiers of the state frames of a node."""
+    sync: int | None
+    """CAN identifier of the frame at which the drives apply their setpoints; None if the protocol has no such frame."""
+    setpoints: range
+    """CAN identifiers that frames with setpoints may have."""
     fault_frames: Mapping[str, Frames]
     """Frames that a fault on demand may affect, by the names used in the faults."""

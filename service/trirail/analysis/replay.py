@@ -255,7 +255,7 @@ class _RecordedPlanner:
 class _RecordedDrives:
     """Implementation of DriveGroup that returns the recorded feedback, and ignores setpoints and commands."""
 
-    bus_load = 0.0
+    bus_load = next_sync = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
     traffic = 0
     path_outputs = (True, True, True)

@@ -15,7 +15,7 @@ from types import FrameType
 from typing import Annotated, Any, Literal
 
 import msgspec
-from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError, UnusedCliTokensError
+from cyclopts import App, CoercionError, CycloptsError, Parameter, UnknownOptionError, UnusedCliTokensError
 
 from trirail import __version__
 from trirail.cli import (
@@ -121,18 +121,27 @@ def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: P
 
 @app.command
 def doctor(
-    config: ConfigFile = None, /, *, quick: Annotated[bool, Flag] = False, json: Annotated[bool, Flag] = False
+    config: Annotated[
+        Path | None, Parameter(help="Configuration file, or a CAN interface; the simulated robot if absent.")
+    ] = None,
+    /,
+    *,
+    quick: Annotated[bool, Flag] = False,
+    json: Annotated[bool, Flag] = False,
 ) -> int:
-    """Check this machine and a configuration.
+    """Check this machine and a configuration, or a CAN interface.
 
-    Exit 1 only if a problem would prevent the robot from running.
+    Exit 1 only if a problem would prevent the robot from running. A CAN interface is checked with the shipped
+    configuration for SocketCAN.
 
     For ten seconds, the command runs cycles that only exchange frames, to measure which rates this machine can hold.
+    On SocketCAN, it then measures for five seconds when the frames of cycles are on the bus: those of a running
+    service, or on an idle bus, test frames that no drive uses.
 
     Parameters
     ----------
     quick
-        Skip that measurement.
+        Skip these measurements.
     json
         Print one JSON object with the numbers instead of text.
     """
@@ -143,8 +152,12 @@ def doctor(
     from trirail.config import SIM, Config, everything
     from trirail.diagnosis import stops
 
-    path = config or SIM
+    path, channel = config or SIM, ""
+    if config is not None and probes.is_interface(config):
+        path, channel = SIM.with_name("socketcan.toml"), str(config)
     findings = everything(path)
+    if channel:
+        findings = findings._replace(config=probes.on_interface(findings.config, channel))
     read: list[Machine] = []
 
     def machine(config: Config) -> Machine:
@@ -157,7 +170,13 @@ def doctor(
     stop_distances = None if findings.mistakes else stops(findings.config)
     if json:
         cycles = [compute_held_rate(each.cycles) for each in read if not isinstance(each.cycles, str)]
-        content = {"checks": checks, "stops": stop_distances, "cycle": cycles[0] if cycles else None}
+        timings = [each.bus_timing for each in read if not isinstance(each.bus_timing, str)]
+        content = {
+            "checks": checks,
+            "stops": stop_distances,
+            "cycle": cycles[0] if cycles else None,
+            "bus": timings[0] if timings else None,
+        }
         terminal.json({"ok": fit, **msgspec.to_builtins(content)})
         return 0 if fit else 1
     terminal.print_checks(checks)

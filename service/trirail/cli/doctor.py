@@ -11,7 +11,7 @@ from trirail_drivers.bus.load import HIGH_LOAD
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.cli import notation
-from trirail.cli.doctor_cycle import cycle
+from trirail.cli.doctor_cycle import cycle, on_bus
 from trirail.cli.key_folder import IssuedCertificate
 from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import Config, Findings, as_built, overlap
@@ -235,7 +235,12 @@ def can_interface(config: Config, machine: Machine) -> list[Check]:
         ]
     if not machine.af_can:
         return [Check("CAN", "failure", "this kernel has no SocketCAN", "modprobe can_raw")]
-    return [Check("CAN", "ok", "SocketCAN"), *_link(config, machine), *_traffic(config, machine.traffic)]
+    return [
+        Check("CAN", "ok", "SocketCAN"),
+        *_link(config, machine),
+        *_traffic(config, machine.traffic),
+        *on_bus(machine.bus_timing, config),
+    ]
 
 
 def _link(config: Config, machine: Machine) -> list[Check]:

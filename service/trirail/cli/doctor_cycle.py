@@ -8,6 +8,7 @@ from trirail.cli.terminal import budget_share
 from trirail.config import Config
 from trirail.diagnosis import Check
 from trirail.diagnosis.bare_loop import Cycles, compute_percentiles
+from trirail.diagnosis.bus_timing import BusTiming
 from trirail.diagnosis.drive_checks import setpoint_budget_us
 from trirail.wire.state import Percentiles
 
@@ -89,6 +90,30 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
     if lost:
         return Check("cycle", "warning", f"{summary}: {lost}", remedy)
     return Check("cycle", "ok", f"{summary}: fine; up to {_frequency(held.up_to_hz or held.rate_hz)}")
+
+
+def on_bus(timing: BusTiming | str, config: Config) -> list[Check]:
+    """Check the timing of cycles on the bus, if it was measured: each setpoint must be sent before the next SYNC."""
+    name = f"{config.can.channel} timing"
+    if isinstance(timing, str):
+        return [Check(name, "ok", f"not measured: {timing}")] if timing else []
+    period, error = 1e6 / timing.rate_hz, timing.interval_error_us
+    sender = "the running service" if timing.source == "service" else "test frames, which no drive uses"
+    finding = (
+        f"{timing.timestamps} loopback timestamps, {timing.syncs} SYNCs of {sender} at {_frequency(timing.rate_hz)}: "
+        f"SYNC off its period p50 {error.p50:.0f}, p99 {error.p99:.0f}, p99.9 {error.p999:.0f}, "
+        f"worst {error.max:.0f} µs"
+    )
+    if timing.setpoints_us is None:
+        return [Check(name, "warning", f"{finding}; no setpoints were sent", "see the faults in trirail status")]
+    last = timing.setpoints_us
+    p50, p999, worst = (f"{value / period:.0%}" for value in (last.p50, last.p999, last.max))
+    finding = f"{finding}; last setpoint p50 {p50}, p99.9 {p999}, worst {worst} of the period after SYNC"
+    if timing.without_setpoints:
+        lacking = f"{timing.without_setpoints} cycles without a setpoint before the next SYNC"
+        remedy = "see the lines above; end other programs, isolate a processor, or set a lower loop.rate_hz"
+        return [Check(name, "warning", f"{finding}; {lacking}", remedy)]
+    return [Check(name, "ok", finding)]
 
 
 def _frequency(hertz: int) -> str:

@@ -13,7 +13,7 @@ Examples = tuple[str, ...]
 GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
     "Begin": {
         "demo": ("trirail demo", "trirail demo --stay"),
-        "doctor": ("trirail doctor", "trirail doctor robot.toml"),
+        "doctor": ("trirail doctor", "trirail doctor robot.toml", "trirail doctor can0"),
         "config": ("trirail config", "trirail config copy socketcan robot.toml", "trirail config show robot.toml"),
         "drives": (
             "trirail drives robot.toml",

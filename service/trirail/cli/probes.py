@@ -19,12 +19,14 @@ from typing import Any
 
 from msgspec import structs
 from trirail_drivers.bus import adapters
+from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.cli.key_folder import AUTHORITY_KEY, IssuedCertificate, KeyFolder
 from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import Config, LoopTable
-from trirail.diagnosis import bare_loop
+from trirail.diagnosis import bare_loop, bus_timing
 from trirail.diagnosis.bare_loop import Cycles
+from trirail.diagnosis.bus_timing import BusTiming
 from trirail.errors import ServiceError
 from trirail.processes import realtime
 from trirail.processes.operating_system import title
@@ -63,6 +65,12 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         cycles = f"a service's loop, process {running}, runs on processor {cpu}"
     if not measures and before is not None:
         time.sleep(COUNTING_S)
+    traffic = traffic_between(before, read_counters(channel))
+    reported = link(channel) if channel else None
+    timing: BusTiming | str = ""
+    if not quick and reported is not None and "UP" in reported.get("flags", ()):
+        with _rights_of(config.loop):
+            timing = measure_bus(config, reported, progress)
     checked = guard(config)
     return Machine(
         release=platform.release(),
@@ -74,9 +82,10 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         cpu=cpu,
         governors=governors(),
         isolated=processors(_text(SYSTEM / "devices/system/cpu/isolated") or ""),
-        link=link(config.can.channel) if config.can.interface == "socketcan" else None,
+        link=reported,
         cycles=cycles,
-        traffic=traffic_between(before, read_counters(channel)),
+        traffic=traffic,
+        bus_timing=timing,
         coalescing=read_coalescing(channel) if channel else None,
         adapter=adapters.missing_support(config.can.interface),
         guard=checked,
@@ -86,6 +95,34 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         if isinstance(checked, str)
         else tuple((each, checked.why_not_linked(each)) for each in config.zenoh.connect),
     )
+
+
+def measure_bus(
+    config: Config, report: dict[str, Any], progress: Callable[[float], None] | None = None
+) -> BusTiming | str:
+    """Measure the timing of cycles on the configuration's SocketCAN interface, or return why that is not possible.
+
+    `report` is the kernel's report on the interface, from `link`.
+    """
+    protocol, can = PROTOCOLS[config.drives.protocol], config.can
+    identifiers = protocol.sync, protocol.setpoints
+    return bus_timing.measure(can.channel, can.bitrate, config.loop, *identifiers, unfit(report, can.bitrate), progress)
+
+
+def unfit(report: dict[str, Any], bitrate: int) -> str:
+    """Return why nothing must be sent on an interface, given the kernel's report on it, or "".
+
+    At another bit rate than that of the drives, even one frame would disturb the bus.
+    """
+    info = report.get("linkinfo", {})
+    data = info.get("info_data", {})
+    if info.get("info_kind") == "vcan":
+        return ""
+    if data.get("bittiming", {}).get("bitrate") != bitrate:
+        return "no service runs on it, and its bit rate is not can.bitrate, so no test frames were sent"
+    if data.get("state") != "ERROR-ACTIVE":
+        return "no service runs on it, and it is not error-active, so no test frames were sent"
+    return ""
 
 
 def guard(config: Config) -> Guard | str:
@@ -154,6 +191,19 @@ def link(name: str) -> dict[str, Any] | None:
         raise ServiceError(f"{' '.join(command)}: {error.stderr.decode(errors='replace').strip()}") from error
     (report,) = json.loads(result.stdout)
     return dict(report)
+
+
+def is_interface(name: Path) -> bool:
+    """Return True if this is the name of a CAN interface and not of a file."""
+    return not name.exists() and re.fullmatch(r"[a-z]*can\d+", str(name)) is not None
+
+
+def on_interface(config: Config, channel: str) -> Config:
+    """Return the configuration for the SocketCAN interface `channel`, with the bit rate that the interface has."""
+    info = (link(channel) or {}).get("linkinfo", {}).get("info_data", {})
+    bitrate = info.get("bittiming", {}).get("bitrate", config.can.bitrate)
+    can = structs.replace(config.can, interface="socketcan", channel=channel, bitrate=bitrate)
+    return structs.replace(config, can=can)
 
 
 def read_coalescing(name: str) -> ReceiveCoalescing | None:

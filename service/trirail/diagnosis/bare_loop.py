@@ -13,7 +13,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -55,13 +55,13 @@ class Cycles(NamedTuple):
         return self.lateness // self.period
 
 
-class _Bus:
+class BareBus:
     """Buffers and socket with which trirail.processes.cycle_frames exchanges the frames of a cycle."""
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, sync: Frame, setpoints: Sequence[Frame]) -> None:
+        """`sync` is sent at the start of each cycle, `setpoints` at its end."""
         self._bus = np.array(BusAccess(descriptor), np.int64)
-        self._sync = packed_frames([Frame(_SYNC)])
-        self._setpoints = packed_frames([Frame(_SETPOINT + i, _DATA) for i in range(len(NAMES))])
+        self._sync, self._setpoints = packed_frames([sync]), packed_frames(setpoints)
         self._arrived = PackedFrames(MOST_FRAMES)
         self._times, self._moment = np.zeros(1, TIMES), np.zeros(2, np.int64)
 
@@ -79,10 +79,14 @@ class _Bus:
         return exchange_frames(self._bus, period_ns, *sent, *memory, lateness, work)
 
 
+def _frames_of_drives(descriptor: int) -> BareBus:
+    return BareBus(descriptor, Frame(_SYNC), [Frame(_SETPOINT + i, _DATA) for i in range(len(NAMES))])
+
+
 def prepare() -> None:
     """Compile the loop, so that the first cycle is not delayed."""
     none = np.zeros(0, np.int64)
-    _Bus(0).exchange(1, none, none)
+    _frames_of_drives(0).exchange(1, none, none)
 
 
 def measure(loop: LoopTable, rate_hz: int, seconds: float, progress: Callable[[float], None] | None = None) -> Cycles:
@@ -96,7 +100,7 @@ def measure(loop: LoopTable, rate_hz: int, seconds: float, progress: Callable[[f
     answers, each = 0, max(1, round(BATCH_S * rate_hz))
     prepare()
     with _drives(loop) as carrier:
-        bus = _Bus(carrier.fileno())
+        bus = _frames_of_drives(carrier.fileno())
         for first in range(0, cycles, each):
             part = slice(first, min(cycles, first + each))
             answers += bus.exchange(period, lateness[part], work[part])

@@ -180,11 +180,13 @@ class Loop:
     def _end(self, tick: Tick) -> None:
         """Record a cycle after its setpoints have been sent, then handle its results and the waiting requests."""
         self._listened = self._never_listens
+        next_ns = tick.deadline_ns + self._period_ns
+        self._drives.next_sync = next_ns * 1e-9
         self._reports.record(tick, self._overruns.all, self._parts_ns)
         self._mark(Part.RECORD)
         self._reports.pass_on()
         self.control.conclude()
-        self._decide(tick.deadline_ns + self._period_ns)
+        self._decide(next_ns)
         self._mark(Part.DECIDE)
 
     def _handle_urgent(self, inputs: Iterable[Request | Disturbance], now_ns: int) -> None:
@@ -212,6 +214,7 @@ class Loop:
 
         """
         waited = self._gateway.postponed
+        self._drives.next_sync = next_ns * 1e-9
         if called or waited:
             self._gateway.read()
             in_time = waited or next_ns - self._now() >= DECISION_BUDGET_NS
@@ -233,6 +236,7 @@ class Loop:
     def _serve_call(self, ticker: Ticker) -> None:
         """Handle requests that arrived during the wait for the next tick, so that they take effect at that tick."""
         self._listened = True
+        self._drives.next_sync = (ticker.deadline_ns + self._period_ns) * 1e-9
         self._gateway.read()
         if inputs := list(self._noted(ticker.deadline_ns + self._period_ns, self._gateway.requests(), waiting=True)):
             self.control.decide(inputs)
