@@ -142,6 +142,7 @@ def doctor(
     from trirail.cli.machine import Machine
     from trirail.config import SIM, Config, everything
     from trirail.diagnosis import stops
+    from trirail.diagnosis.drive_checks import bus_use
 
     path = config or SIM
     findings = everything(path)
@@ -157,7 +158,8 @@ def doctor(
     stop_distances = None if findings.mistakes else stops(findings.config)
     if json:
         cycles = [compute_held_rate(each.cycles) for each in read if not isinstance(each.cycles, str)]
-        content = {"checks": checks, "stops": stop_distances, "cycle": cycles[0] if cycles else None}
+        bus = None if findings.mistakes else bus_use(findings.config)
+        content = {"checks": checks, "stops": stop_distances, "cycle": cycles[0] if cycles else None, "bus": bus}
         terminal.json({"ok": fit, **msgspec.to_builtins(content)})
         return 0 if fit else 1
     terminal.print_checks(checks)
