@@ -7,6 +7,7 @@ import random
 from collections.abc import Iterator
 
 import can
+import msgspec
 import pytest
 from canopen import SdoAbortedError
 from drivers.foreign import Habits

@@ -9,10 +9,11 @@ from typing import Any, Final
 import can
 import msgspec
 import pytest
+from drivers.test_look import OWN
 from edsfiles import eds
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from rigs import START, STEP, Closing, ideal_servo
+from rigs import START, STEP, Closing, alike, ideal_servo
 from trirail_drivers.bus.load import HIGH_LOAD
 from trirail_drivers.cia402 import canopen_frames, inspection
 from trirail_drivers.cia402.eds import SERVO
@@ -23,7 +24,6 @@ from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import SimulatedDrive
 
 from drivers import test_cia402
-from drivers.test_look import OWN
 
 MAPPABLE, LACKING, FIXED_4, FIXED_8 = "mappable", "lacking", "fixed at 4 bytes", "fixed at 8 bytes"
 KINDS: Final = (MAPPABLE, LACKING, FIXED_4, FIXED_8)
@@ -63,8 +63,8 @@ class Rig(test_cia402.Rig):
     ) -> None:
         self._files, self._kinds = files, kinds
         io = keys.pop("io", NO_IO)
-        each = (Drive(node=node, counts_per_metre=1e6) for node in (1, 2, 3))
-        super().__init__(Drives("cia402", *each, sdo_timeout=0.01, **keys), io)
+        a, b, c = alike()
+        super().__init__(Drives("cia402", a, b, c, sdo_timeout=0.01, **keys), io)
         self.drives._bitrate = bitrate
 
     def device(self, drive: Drive, counts: float) -> SimulatedDrive:
