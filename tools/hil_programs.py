@@ -113,7 +113,11 @@ class Machine:
         done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, timeout=STEP_TIMEOUT_S, check=False)
         answer = json.loads(done.stdout)
         (check,) = [check for check in answer["checks"] if check["name"] == "can0 timing"]
-        if answer["bus"] is None or answer["bus"]["source"] != "service" or answer["bus"]["setpoints_us"] is None:
+        if (
+            answer["bus_timing"] is None
+            or answer["bus_timing"]["source"] != "service"
+            or answer["bus_timing"]["setpoints_us"] is None
+        ):
             raise Failed(f"the doctor says of the service's frames: {check}")
         return str(check["found"])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta, Struct
 
@@ -27,6 +27,8 @@ NodeId = Annotated[int, Meta(ge=0, le=127)]
 """Node id: CANopen allows 1 to 127, ODrive 0 to 62; the driver refuses other values."""
 
 
+DEFAULT_BITRATE: Final = 1_000_000
+"""Bit rate of a bus [bit/s], unless the configuration sets another one."""
 CountsPerMetre = Annotated[float, Meta(ge=1e-3, le=1e12)]
 
 
@@ -76,7 +78,7 @@ class Can(Struct, frozen=True, forbid_unknown_fields=True):
     """`simulated`, or the name of a python-can interface, such as `socketcan`."""
     channel: Name = ""
     """Channel of the interface, such as `can0`."""
-    bitrate: Annotated[int, Meta(ge=10_000, le=8_000_000)] = 1_000_000
+    bitrate: Annotated[int, Meta(ge=10_000, le=8_000_000)] = DEFAULT_BITRATE
     """Bit rate [bit/s], at most 1 Mbit/s on a physical bus. The bus load is calculated from this value, and interfaces
     that set the bit rate themselves use it.
     """
@@ -229,6 +231,11 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     sdo_timeout: Timeout = 0.5
     """Longest time until a drive answers at set-up, or until a written value takes effect [s]. A drive may take ten
     times as long to boot.
+    """
+    velocity_offset: Literal["auto", "always", "never"] = "auto"
+    """Use of the velocity offset 60B1h as velocity feed-forward; it lengthens the setpoint PDO of a CiA 402 drive from
+    4 to 8 bytes. With `"auto"`, all three drives use it unless the worst-case bus load would then exceed 80 %.
+    Without it, drives follow with more lag. A drive without 60B1h, or with a fixed PDO mapping, keeps what it has.
     """
 
     @property

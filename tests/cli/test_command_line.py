@@ -302,6 +302,25 @@ def test_the_banner_names_the_next_command_where_it_reaches_the_service(capsys: 
     assert "next       trirail enable --robot left --connect tcp/127.0.0.1:7999\n" in said
 
 
+def test_the_banner_says_how_much_of_the_bus_is_used_and_why_setpoints_are_short(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    ready: dict[str, dict[str, Any]] = {
+        "loop": {"lacking": [], "bus_load": 0.786},
+        "recorder": {"live": "", "recording": "x.rrd"},
+        "gateway": {"warnings": []},
+    }
+    config = load(SIM)
+    fast = msgspec.structs.replace(config, loop=msgspec.structs.replace(config.loop, rate_hz=1250))
+    can = msgspec.structs.replace(config.can, interface="socketcan", channel="can0")
+    terminal.up(msgspec.structs.replace(fast, can=can), ready)
+    said = capsys.readouterr().out
+    assert "bus load   1.25 kHz uses 79 % of can0\n" in said
+    assert "warning setpoints without velocity offset (4 bytes), because 8 bytes would use 94 %\n" in said
+    terminal.up(config, ready)
+    assert "velocity offset" not in capsys.readouterr().out
+
+
 def test_who_asks_for_a_command_that_there_is_not_is_led_to_the_list_of_them(run: Run) -> None:
     code, _, err = run("dance")
     assert code == 2

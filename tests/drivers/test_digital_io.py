@@ -7,6 +7,7 @@ import random
 from collections.abc import Iterator
 
 import can
+import msgspec
 import pytest
 from canopen import SdoAbortedError
 from drivers.foreign import Habits
@@ -114,14 +115,15 @@ def test_a_survey_shows_the_changes_and_writes_nothing(rig: Rig) -> None:
 def test_three_drives_of_outputs_do_not_fit_at_a_full_bus() -> None:
     each = DigitalIo(VALVE)
     loads = []
+    config = msgspec.structs.replace(CONFIG, velocity_offset="always")
     for io in (NO_IO, (each, *NO_IO[1:]), (each, each, NO_IO[0])):
-        rig = Rig(io=io)
+        rig = Rig(config, io=io)
         rig.drives.configure(STEP)
         loads.append(rig.drives.bus_load)
         rig.drives.close()
     frame = (8 * 4 + 47 + (34 + 8 * 4 - 1) // 4) * 1000 / 1e6
     assert [load - loads[0] for load in loads] == pytest.approx([0.0, frame, 2 * frame])
-    rig = Rig(io=(each, each, each))
+    rig = Rig(config, io=(each, each, each))
     with pytest.raises(BusError, match=r"1000 Hz takes 103% of the bus .* highest rate that fits is 9"):
         rig.drives.configure(STEP)
     rig.drives.close()

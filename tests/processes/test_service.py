@@ -927,7 +927,7 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> N
     [
         ("rate_hz = 1000", "rate_hx = 1000", "loop.rate_hx: unknown key; did you mean rate_hz?"),
         ('interface = "simulated"', 'interface = "vcan"', 'can.interface "vcan" is unknown'),
-        ("bitrate = 1_000_000", "bitrate = 500_000", "takes 150% of the bus at 500000 bit/s"),
+        ("bitrate = 1_000_000", "bitrate = 500_000", "takes 126% of the bus at 500000 bit/s"),
         ('listen = ["tcp/127.0.0.1:7447"]', 'listen = ["tcp/127.0.0.1:{port}"]', "cannot listen on tcp/127.0.0.1"),
         ("live_port = 9876", "live_port = {port}", "telemetry.live_port"),
     ],

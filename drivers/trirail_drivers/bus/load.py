@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 from trirail_drivers.errors import BusError
 
@@ -59,3 +59,38 @@ def warning(rate_hz: float, load: float) -> str:
         if load > HIGH_LOAD
         else ""
     )
+
+
+class TrafficPlan(NamedTuple):
+    """Traffic that follows from the configuration, before any drive has answered."""
+
+    traffic: Traffic
+    setpoint_bytes: int = 8
+    """Data length of a setpoint [bytes]."""
+    velocity_offset: bool = True
+    """Whether a setpoint contains a velocity for feed-forward."""
+    full_load: float | None = None
+    """Bus load with the velocity offset, if the velocity offset is left out because of this load; otherwise None."""
+    remedy: str = ""
+    """Change of the configuration that would shorten the setpoints, or ""."""
+
+    @property
+    def omission(self) -> str:
+        """Statement that the velocity offset is left out because of the bus load, with the reason; otherwise ""."""
+        if self.full_load is None:
+            return ""
+        return (
+            f"setpoints without velocity offset ({self.setpoint_bytes} bytes), "
+            f"because 8 bytes would use {percent(self.full_load)}"
+        )
+
+
+def percent(share: float) -> str:
+    """Return a share in percent, rounded, for people."""
+    return f"{100.0 * share:.0f} %"
+
+
+def usage(rate_hz: float, load: float, bus: str) -> str:
+    """Return the share of a named bus that a cycle uses in the worst case, for people."""
+    rate = f"{rate_hz / 1000:g} kHz" if rate_hz >= 1000 else f"{rate_hz:g} Hz"
+    return f"{rate} uses {percent(load)} of {bus}"

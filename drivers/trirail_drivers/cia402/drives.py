@@ -15,6 +15,7 @@ from functools import partial
 import can
 
 from trirail_drivers import config
+from trirail_drivers.bus import load
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import packed_frames
 from trirail_drivers.bus.reopening import Reopening
@@ -30,6 +31,7 @@ from trirail_drivers.driver.axis_row import NO_OFFSET, NOTHING_SENT
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
+from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
@@ -79,10 +81,16 @@ class Cia402(Driver[Cia402Axis]):
         the velocity limit of the sliders [m/s]. A drive in fault causes no error: the feedback reports the fault, and
         `reset` clears it.
         """
-        self._set_period(period, process_data.traffic(axis.exchange for axis in self._axes))
-        scales = tuple(axis.scale for axis in self._axes)
         io = [axis.io for axis in self._axes]
-        ones = setup.setup_tasks(self._wire.bus, self._drives, scales, period, self._clock, io)
+        plan = process_data.plan_traffic(self._drives, io, 1.0 / period, self._bitrate)
+        self._check_plan(period, plan)
+        for axis in self._axes:
+            exchange = process_data.default_exchange(axis.node, axis.io, velocity_offset=plan.velocity_offset)
+            axis.set_up(exchange, axis.units)
+        scales = tuple(axis.scale for axis in self._axes)
+        ones = setup.setup_tasks(
+            self._wire.bus, self._drives, scales, period, self._clock, io, velocity_offset=plan.velocity_offset
+        )
         configure = partial(setup.configure, self._wire.bus, self._drives, ones, fastest, awaits=awaits)
         done, lost = self._set_up(configure, awaits=awaits)
         each = [
@@ -103,6 +111,19 @@ class Cia402(Driver[Cia402Axis]):
         self._prepare_frames()
         self._warn_of_setup(recovery.setups)
         self._report_absent(lost)
+
+    def _check_plan(self, period: float, plan: load.TrafficPlan) -> None:
+        """Set the cycle period [s], and emit a warning if the velocity offset is left out.
+
+        Raises BusError if the planned frames do not fit on the bus.
+        """
+        try:
+            self._set_period(period, plan.traffic)
+        except BusError as error:
+            raise BusError("; ".join(filter(None, (str(error), plan.remedy)))) from error
+        if plan.omission:
+            used = load.usage(1.0 / period, self.bus_load, "the bus")
+            self._wire.warn(f"CAN bus: {used}: {plan.omission}; the drives follow with more lag")
 
     def _apply_start(self, axis: Cia402Axis, start: Start) -> None:
         """Store the state that a drive had at the end of its set-up, and handle its frames from now on."""

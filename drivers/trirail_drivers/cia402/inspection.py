@@ -7,10 +7,10 @@ from typing import Any
 
 import can
 
-from trirail_drivers.cia402 import canopen_frames, setup
+from trirail_drivers.cia402 import canopen_frames, process_data, setup
 from trirail_drivers.cia402.one_drive import SetUp
 from trirail_drivers.cia402.sdo import run_setups
-from trirail_drivers.config import NO_IO, DigitalIo, Drives
+from trirail_drivers.config import DEFAULT_BITRATE, NO_IO, DigitalIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError, DriveError
@@ -26,29 +26,35 @@ def inspect(
     *,
     apply: bool,
     io: Sequence[DigitalIo] = NO_IO,
+    bitrate: int = DEFAULT_BITRATE,
 ) -> list[dict[str, Any]]:
     """Return a description of each drive, with the differences between its values and those that the cycle needs.
 
     `fastest` is the velocity limit of the sliders [m/s], which must fit the drives' units; `io` contains the digital
-    outputs and inputs of each drive.
+    outputs and inputs of each drive, and `bitrate` is that of the bus [bit/s]. "bus_load" is the worst-case load of the
+    bus with the PDOs that the drives can map, or None unless all three drives were read.
 
     With `apply`, the required values are written to all three drives or, if one of them is refused, to none. The drives
     have no power then and do not store the values permanently. Without `apply`, nothing is written. "refused" contains
     the reason if a drive does not answer or is refused. Raises DriveError if `apply` fails.
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
+    offset = process_data.plan_traffic(drives, io, 1.0 / period, bitrate).velocity_offset
     if apply:
-        results = inspect(bus, drives, period, clock, fastest, apply=False, io=io)
+        results = inspect(bus, drives, period, clock, fastest, apply=False, io=io, bitrate=bitrate)
         refused = dict.fromkeys(each["refused"] for each in results if each["refused"])
         raise_combined([DriveError(text) for text in refused])
-        done = setup.configure(bus, drives, setup.setup_tasks(bus, drives, scales, period, clock, io), fastest)
+        tasks = setup.setup_tasks(bus, drives, scales, period, clock, io, velocity_offset=offset)
+        made = [result[0] for result in setup.configure(bus, drives, tasks, fastest) if result is not None]
         for drive in drives.each:
             bus.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node).message())
-        return [_as_json(result[0]) for result in done if result is not None]
-    ends = setup.survey(bus, drives, scales, period, clock, fastest, io)
+        load = _bus_load(made, drives, period, bitrate)
+        return [_as_json(each, load) for each in made]
+    ends = setup.survey(bus, drives, scales, period, clock, fastest, io, velocity_offset=offset)
     looked = [end for end in ends if not isinstance(end, DriveError)]
+    load = _bus_load(looked, drives, period, bitrate)
     results = [
-        {"name": name, "node": drive.node, "refused": str(end)} if isinstance(end, DriveError) else _as_json(end)
+        {"name": name, "node": drive.node, "refused": str(end)} if isinstance(end, DriveError) else _as_json(end, load)
         for name, drive, end in zip(NAMES, drives.each, ends, strict=True)
     ]
     try:
@@ -78,7 +84,13 @@ def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int
     return read
 
 
-def _as_json(made: SetUp) -> dict[str, Any]:
+def _bus_load(made: Sequence[SetUp], drives: Drives, period: float, bitrate: int) -> float | None:
+    if len(made) < len(NAMES):
+        return None
+    return process_data.traffic(each.exchange for each in made).bus_load(1.0 / period, bitrate, drives.heartbeat)
+
+
+def _as_json(made: SetUp, load: float | None) -> dict[str, Any]:
     who = made.identity
     return {
         "name": made.name,
@@ -90,6 +102,8 @@ def _as_json(made: SetUp) -> dict[str, Any]:
         "serial": who.serial,
         "modes": None if who.modes is None else f"{who.modes & 0xFFFF_FFFF:08X}",
         "way": made.exchange.name,
+        "setpoint_bytes": made.exchange.setpoints.size,
+        "bus_load": load,
         "velocity_unit": made.units.velocity_name,
         "acceleration_unit": made.units.acceleration_name,
         "differences": [difference._asdict() for difference in made.differences],

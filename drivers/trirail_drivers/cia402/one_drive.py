@@ -94,6 +94,8 @@ class SetupTask(NamedTuple):
     period: float
     """Cycle period [s]."""
     io: DigitalIo = NO_IO[0]
+    velocity_offset: bool = True
+    """Whether the setpoints contain the velocity offset if the drive has it."""
 
 
 async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
@@ -126,7 +128,7 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
     if one.io.inputs:
         await check_inputs(differences)
     pdos = Pdos(differences, drive.node)
-    setpoints, controlword = await pdos.setpoints(mode)
+    setpoints, controlword = await pdos.setpoints(mode, velocity_offset=one.velocity_offset)
     feedback, status, polled, inputs = await pdos.feedback(inputs=bool(one.io.inputs))
     outputs = await pdos.outputs() if one.io.outputs else None
     await pdos.switch_off_others()

@@ -86,15 +86,17 @@ class Pdos:
         self._node = node
         self._used: set[int] = set()
 
-    async def setpoints(self, mode: int) -> tuple[SetpointPdo, int | None]:
+    async def setpoints(self, mode: int, *, velocity_offset: bool = True) -> tuple[SetpointPdo, int | None]:
         """Set up the SYNC-driven RPDO of the setpoints and the event-driven RPDO of the controlword.
 
         Return the former, and the identifier of the latter, or None if the setpoints' RPDO contains the controlword.
+        Without `velocity_offset`, the setpoints contain a velocity offset only if a fixed mapping does.
         Raises DriveError if an RPDO cannot be mapped and no fixed RPDO fits.
         """
         position = POSITIONS[mode]
         wanted: list[tuple[int, ...]] = [(position,)]
-        if mode == CYCLIC_SYNCHRONOUS_POSITION and await self._mappable(VELOCITY_OFFSET):
+        offset = velocity_offset and mode == CYCLIC_SYNCHRONOUS_POSITION
+        if offset and await self._mappable(VELOCITY_OFFSET):
             wanted.insert(0, (position, VELOCITY_OFFSET))
         control = await self._map(RPDO, canopen_frames.RPDO1 + self._node, ON_CHANGE, (CONTROLWORD,))
         for entries in wanted:
@@ -108,9 +110,20 @@ class Pdos:
         if control is None and not chosen.has_controlword:
             pdo = await self._find_fixed(RPDO, lambda entries: entries == (CONTROLWORD,), "controlword 6040", ON_CHANGE)
             control = pdo.identifier
-        if mode == CYCLIC_SYNCHRONOUS_POSITION and not chosen.has_velocity:
+        if offset and not chosen.has_velocity:
             self._drive.lack((0x60B1, 0), "it cannot be mapped into the setpoint's PDO")
+        if not velocity_offset:
+            await self._leave_out_offset(mode, mapped=chosen.has_velocity)
         return chosen, control
+
+    async def _leave_out_offset(self, mode: int, *, mapped: bool) -> None:
+        """Set a velocity offset that no PDO contains to 0: another set-up may have left a value in the drive, which the
+        drive would add to the velocity of every setpoint.
+        """
+        if mapped:
+            self._drive.add_note("the fixed mapping of its setpoints contains the velocity offset, which stays in use")
+        elif mode == CYCLIC_SYNCHRONOUS_POSITION and (held := await self._remote.peek(0x60B1)):
+            await self._drive.put((0x60B1, 0), held, 0, "no velocity offset")
 
     async def outputs(self) -> int | None:
         """Set up the SYNC-driven RPDO of the digital outputs; return its identifier, or None if no RPDO is suitable."""

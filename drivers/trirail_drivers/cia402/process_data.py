@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from struct import Struct
 from typing import Final
 
 from trirail_drivers.bus.frames import Frame, frame_bits
-from trirail_drivers.bus.load import Traffic
+from trirail_drivers.bus.load import HIGH_LOAD, Traffic, TrafficPlan, percent
 from trirail_drivers.cia402 import canopen_frames
-from trirail_drivers.config import NO_IO, DigitalIo
+from trirail_drivers.config import NO_IO, DigitalIo, Drives
 
 INTERPOLATED_POSITION: Final = 7
 CYCLIC_SYNCHRONOUS_POSITION: Final = 8
@@ -178,11 +178,12 @@ class Exchange:
         return f"{mode}{offset}, statusword {status}{polled}, {'node guarding' if self.guarded else 'heartbeat'}"
 
 
-def default_exchange(node: int, io: DigitalIo = NO_IO[0]) -> Exchange:
+def default_exchange(node: int, io: DigitalIo = NO_IO[0], *, velocity_offset: bool = True) -> Exchange:
     """Return the PDOs for a drive that has every optional object of CiA 301 and CiA 402-2."""
+    entries = (TARGET_POSITION, VELOCITY_OFFSET) if velocity_offset else (TARGET_POSITION,)
     return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,
-        SetpointPdo(canopen_frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),
+        SetpointPdo(canopen_frames.RPDO2 + node, entries),
         canopen_frames.RPDO1 + node,
         FeedbackPdo(canopen_frames.TPDO2 + node, (ACTUAL_POSITION,)),
         canopen_frames.TPDO1 + node,
@@ -209,3 +210,29 @@ def traffic(exchanges: Iterable[Exchange]) -> Traffic:
         most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
         output_bits=canopen_frames.TRAFFIC.output_bits,
     ).with_outputs(sum(exchange.outputs is not None for exchange in exchanges))
+
+
+def plan_traffic(drives: Drives, io: Sequence[DigitalIo], rate_hz: float, bitrate: int) -> TrafficPlan:
+    """Decide whether the setpoints contain the velocity offset, and return the traffic that results.
+
+    The decision assumes that every drive has the velocity offset and is the same for all three drives: a drive without
+    velocity feed-forward follows later than the others, which would bend the path of the platform. It depends only on
+    the configuration, so that a drive that appears later is set up like the others.
+    """
+    full, short = (
+        traffic(
+            default_exchange(drive.node, digital, velocity_offset=velocity_offset)
+            for drive, digital in zip(drives.each, io, strict=True)
+        )
+        for velocity_offset in (True, False)
+    )
+    load = full.bus_load(rate_hz, bitrate, drives.heartbeat)
+    if drives.velocity_offset == "never":
+        return TrafficPlan(short, 4, velocity_offset=False)
+    if load <= HIGH_LOAD:
+        return TrafficPlan(full)
+    if drives.velocity_offset == "always":
+        shorter = short.bus_load(rate_hz, bitrate, drives.heartbeat)
+        remedy = f'drives.velocity_offset = "auto" uses {percent(shorter)}' if shorter <= 1.0 else ""
+        return TrafficPlan(full, remedy=remedy)
+    return TrafficPlan(short, 4, velocity_offset=False, full_load=load)

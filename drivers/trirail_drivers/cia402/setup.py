@@ -77,12 +77,14 @@ def survey(
     clock: Clock,
     fastest: float | None = None,
     io: Sequence[DigitalIo] = NO_IO,
+    *,
+    velocity_offset: bool = True,
 ) -> list[SetUp | DriveError]:
     """Read the identity of each drive and find the values that its set-up would change.
 
     Nothing is written, and no state of a drive is changed.
     """
-    each = _drives(bus, drives, scales, period, clock, io)
+    each = _drives(bus, drives, scales, period, clock, io, velocity_offset=velocity_offset)
     conversations = [rehearse_setup(one, read_only=True) for one in each]
     ends = run_setups(bus, clock, [one.remote for one in each], "reading", conversations)
     return [end if isinstance(end, DriveError) else _velocity_refused(end, fastest) or end for end in ends]
@@ -95,15 +97,18 @@ def setup_tasks(
     period: float,
     clock: Clock,
     io: Sequence[DigitalIo] = NO_IO,
+    *,
+    velocity_offset: bool = True,
 ) -> list[SetupTask]:
-    """Return the set-up tasks of the three drives, given the cycle period [s] and the drives' digital I/O.
+    """Return the set-up tasks of the three drives, given the cycle period [s], the drives' digital I/O, and whether the
+    setpoints contain the velocity offset.
 
     Raises DriveError for settings that no drive can accept.
     """
     check_nodes(drives)
     heartbeat_period_ms(drives)
     interpolation_periods(period)
-    return _drives(bus, drives, scales, period, clock, io)
+    return _drives(bus, drives, scales, period, clock, io, velocity_offset=velocity_offset)
 
 
 def _drives(
@@ -113,10 +118,15 @@ def _drives(
     period: float,
     clock: Clock,
     io: Sequence[DigitalIo],
+    *,
+    velocity_offset: bool,
 ) -> list[SetupTask]:
     asked = remotes(bus, drives, clock)
     each = zip(asked, drives.each, scales, io, strict=True)
-    return [SetupTask(remote, drive, drives, scale, period, digital) for remote, drive, scale, digital in each]
+    return [
+        SetupTask(remote, drive, drives, scale, period, digital, velocity_offset)
+        for remote, drive, scale, digital in each
+    ]
 
 
 def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:

@@ -30,6 +30,7 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
     for name, drive in zip(NAMES, drives.each, strict=True):
         for key in _CANOPEN_ONLY:
             yield Rule(f"drives.{name}.{key}", (), partial(_check_canopen_only, name, drive, key))
+    yield Rule("drives.velocity_offset", (), partial(_check_velocity_offset, drives))
     yield Rule("drives", tuple(f"drives.{name}.node" for name in NAMES), partial(setup.check_nodes, drives))
     for leg, (name, drive) in enumerate(zip(NAMES, drives.each, strict=True)):
         counts, scale = f"drives.{name}.counts_per_metre", (f"drives.{name}.offset", f"drives.{name}.direction")
@@ -52,6 +53,14 @@ def _check_canopen_only(name: str, drive: Drive, key: str) -> None:
     if value:
         shown = f" = {value}" if isinstance(value, str) else ""
         raise DriveError(f"drives.{name}.{key}{shown}: {_CANOPEN_ONLY[key]}")
+
+
+def _check_velocity_offset(drives: Drives) -> None:
+    if drives.velocity_offset != "auto":
+        raise DriveError(
+            f'drives.velocity_offset = "{drives.velocity_offset}": only CiA 402 drives have the velocity offset 60B1h; '
+            "every setpoint of an ODrive contains a velocity; omit the key"
+        )
 
 
 def _offset_remedy(widest: float) -> str:

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from trirail_drivers import config
-from trirail_drivers.cia402 import canopen_frames, checks, units
+from trirail_drivers.cia402 import canopen_frames, checks, process_data, units
 from trirail_drivers.cia402.backup import restore, save
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.inspection import inputs, inspect
@@ -61,6 +61,7 @@ CIA402 = Protocol(
     rules=checks.rules,
     files=checks.files,
     traffic=canopen_frames.TRAFFIC,
+    plan_traffic=process_data.plan_traffic,
     simulated_drive=_simulated_drive,
     inspect=inspect,
     inputs=inputs,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from trirail_drivers import config
+from trirail_drivers.bus.load import TrafficPlan
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.odrive import cansimple, checks
 from trirail_drivers.odrive.drives import Odrive
@@ -32,12 +34,23 @@ def _simulated_drive(
     )
 
 
+def _plan_traffic(
+    drives: config.Drives,  # noqa: ARG001  one signature for all
+    io: Sequence[config.DigitalIo],  # noqa: ARG001
+    rate_hz: float,  # noqa: ARG001
+    bitrate: int,  # noqa: ARG001
+) -> TrafficPlan:
+    """Return the traffic of ODrives, which does not depend on the configuration."""
+    return TrafficPlan(cansimple.TRAFFIC)
+
+
 ODRIVE = Protocol(
     name="odrive",
     driver=Odrive,
     rules=checks.rules,
     files=checks.files,
     traffic=cansimple.TRAFFIC,
+    plan_traffic=_plan_traffic,
     simulated_drive=_simulated_drive,
     inspect=None,
     inputs=None,

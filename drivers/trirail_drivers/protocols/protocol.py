@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import can
 
 from trirail_drivers import config
-from trirail_drivers.bus.load import Traffic
+from trirail_drivers.bus.load import Traffic, TrafficPlan
 from trirail_drivers.cia402.backup import RestoreResult
 from trirail_drivers.cia402.parameter_file import SavedParameters
 from trirail_drivers.driver.requirements import Requirements, Rule
@@ -33,7 +33,11 @@ class Protocol:
     files: Callable[[config.Drives], Iterator[Rule]]
     """Function that yields checks that read the files named in the settings."""
     traffic: Traffic
-    """Bus traffic of the drives and the service."""
+    """Bus traffic of drives with every optional object and without digital outputs and inputs."""
+    plan_traffic: Callable[[config.Drives, Sequence[config.DigitalIo], float, int], TrafficPlan]
+    """Function that returns the traffic expected from the configuration. Arguments: section [drives], the digital
+    outputs and inputs of each drive, the cycle rate [Hz] and the bit rate [bit/s].
+    """
     simulated_drive: Callable[[config.Simulated, config.Drives, config.Drive, float], SimulatedDevice]
     """Function that returns one simulated drive, whose slider is at rest at a position [m]."""
     inspect: Callable[..., list[dict[str, Any]]] | None
@@ -41,7 +45,7 @@ class Protocol:
     cannot be inspected.
 
     Arguments: the bus, section [drives], the period [s], the clock, the velocity limit of the sliders [m/s], whether to
-    `apply` the changes, and the digital outputs and inputs `io` of each drive.
+    `apply` the changes, the digital outputs and inputs `io` of each drive, and the `bitrate`.
     """
     save: Callable[..., dict[str, SavedParameters | DriveError]] | None
     """Function that reads the parameters of drives; None if the drives have no object dictionary.

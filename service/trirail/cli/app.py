@@ -151,6 +151,7 @@ def doctor(
     from trirail.cli.machine import Machine
     from trirail.config import SIM, Config, everything
     from trirail.diagnosis import stops
+    from trirail.diagnosis.drive_checks import bus_use
 
     path, channel = config or SIM, ""
     if config is not None and probes.is_interface(config):
@@ -175,7 +176,8 @@ def doctor(
             "checks": checks,
             "stops": stop_distances,
             "cycle": cycles[0] if cycles else None,
-            "bus": timings[0] if timings else None,
+            "bus": None if findings.mistakes else bus_use(findings.config),
+            "bus_timing": timings[0] if timings else None,
         }
         terminal.json({"ok": fit, **msgspec.to_builtins(content)})
         return 0 if fit else 1

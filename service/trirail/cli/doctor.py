@@ -8,7 +8,6 @@ from typing import Any, Final
 
 from trirail_drivers.bus.frames import bits_of
 from trirail_drivers.bus.load import HIGH_LOAD
-from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.cli import notation
 from trirail.cli.doctor_cycle import cycle, on_bus
@@ -16,6 +15,7 @@ from trirail.cli.key_folder import IssuedCertificate
 from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import Config, Findings, as_built, overlap
 from trirail.diagnosis import Check, Verdict, diagnose, failed_checks
+from trirail.diagnosis.drive_checks import plan_traffic
 from trirail.wire.endpoints import ReachableBy, endpoint_of, reach, tcp_address
 from trirail.wire.vocabulary import Role
 
@@ -256,9 +256,7 @@ def _link(config: Config, machine: Machine) -> list[Check]:
     if info.get("info_kind") == "vcan":
         return [Check(name, "ok", "up; virtual, without bitrate and error states")]
     data = info.get("info_data", {})
-    outputs = sum(bool(each.outputs) for each in config.drive_io)
-    traffic = PROTOCOLS[config.drives.protocol].traffic.with_outputs(outputs)
-    queue = _queue(name, link.get("txqlen"), traffic.most_sent)
+    queue = _queue(name, link.get("txqlen"), plan_traffic(config).traffic.most_sent)
     return [
         _bitrate(name, bitrate, data, up),
         _state(name, data, up),

@@ -49,6 +49,7 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
     from trirail.commissioning import drive_report
     from trirail.config import SIM, load
     from trirail.diagnosis.check import is_simulated
+    from trirail.diagnosis.drive_checks import usage_of
 
     settings = load(config or SIM)
     inspect = PROTOCOLS[settings.drives.protocol].inspect
@@ -60,7 +61,8 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
     with open_bus(settings.can, settings.drives) as bus:
         fastest = settings.limits.slider.fastest
         timing = settings.period, time.monotonic, fastest
-        reports = inspect(bus, settings.drives, *timing, apply=apply, io=settings.drive_io)
+        io, bitrate = settings.drive_io, settings.can.bitrate
+        reports = inspect(bus, settings.drives, *timing, apply=apply, io=io, bitrate=bitrate)
     fit = not any(each["refused"] for each in reports)
     if json:
         terminal.json({"ok": fit, "applied": apply, "drives": reports})
@@ -71,6 +73,8 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
                 *drive_report.format_differences(each, applied=apply),
             ):
                 terminal.print_line(line)
+        if (used := reports[0].get("bus_load")) is not None:
+            terminal.print_line(usage_of(settings, used))
         if not is_simulated(settings.can):
             terminal.print_line(UNTESTED_NOTE)
     return 0 if fit else 1

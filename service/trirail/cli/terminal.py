@@ -89,6 +89,7 @@ def print_error_json(error: TrirailError) -> None:
 def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
     """Print that the service is running, with its addresses and missing rights."""
     from trirail.config import metrics_url
+    from trirail.diagnosis.drive_checks import plan_traffic, usage_of
 
     loop, recorder = ready["loop"], ready["recorder"]
     out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz")
@@ -98,8 +99,10 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
     out.print(f"    recording  {plain(recorder['recording'])}", soft_wrap=True)
     if url := metrics_url(config):
         out.print(f"    metrics    {plain(url)}", soft_wrap=True)
-    out.print(f"    bus load   {loop['bus_load']:.0%}")
+    out.print(f"    bus load   {usage_of(config, loop['bus_load'])}")
     out.print(f"    next       {plain(' '.join(['trirail enable', *_reach(config)]))}", soft_wrap=True)
+    if omission := plan_traffic(config).omission:
+        out.print(f"    [yellow]warning[/] {omission}", soft_wrap=True)
     if warning := load.warning(config.loop.rate_hz, loop["bus_load"]):
         out.print(f"    [yellow]warning[/] {warning}", soft_wrap=True)
     for lack in loop["lacking"]:

@@ -70,7 +70,8 @@ class Session:
             return Judgement("ok", words), {}
         fastest = self._config.limits.slider.fastest
         timing = self._config.period, time.monotonic, fastest
-        self._inspected = inspect(self.environment.bus, drives, *timing, apply=False, io=self._config.drive_io)
+        bus, io, bitrate = self.environment.bus, self._config.drive_io, self._config.can.bitrate
+        self._inspected = inspect(bus, drives, *timing, apply=False, io=io, bitrate=bitrate)
         lines = tuple(
             line
             for each in self._inspected

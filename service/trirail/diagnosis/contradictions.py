@@ -14,6 +14,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.config import Config, SliderLimits, geometry, room
 from trirail.diagnosis.check import Check, ConfigCheck, format_value, is_simulated
+from trirail.diagnosis.drive_checks import plan_traffic
 from trirail.kinematics.geometry import gains, travels
 from trirail.quantities import FAMILIAR_UNITS
 
@@ -168,15 +169,19 @@ def _simulated(config: Config) -> Iterator[Check]:
     """Check that simulated servos can follow the setpoints.
 
     The lag of a servo is the motion during its time constant that feed-forward does not compensate, plus the motion in
-    a cycle.
+    a cycle. Without velocity offset, there is no feed-forward.
     """
     if not is_simulated(config.can):
         return
     slider, servo = config.limits.slider, config.can.simulated
-    lag = slider.fastest * (abs(1.0 - servo.feed_forward_gain) * servo.time_constant + config.period)
+    offset = plan_traffic(config).velocity_offset
+    gain = servo.feed_forward_gain if offset else 0.0
+    lag = slider.fastest * (abs(1.0 - gain) * servo.time_constant + config.period)
     if lag > slider.following_error:
         finding = f"simulated servos lag {lag * 1e3:.3g} mm at limits.slider.velocity, beyond its following_error"
         remedy = "set a shorter time_constant, or a feed_forward_gain nearer to 1"
+        if not offset:
+            remedy = 'set a shorter time_constant, or drives.velocity_offset = "always"'
         yield Check("simulated", "warning", finding, remedy, "can.simulated.time_constant")
     for key, maximum, limit in (
         ("max_velocity", servo.max_velocity, slider.fastest),
@@ -197,5 +202,5 @@ CONFIG_CHECKS = (
     ConfigCheck((*_POSES, *_TRAVEL), _reached),
     ConfigCheck((*_RATES, *_POSES), _rates),
     ConfigCheck((*_POSES, *_WINDOWS, "limits.slider.velocity", "limits.slider.position", "loop.rate_hz"), _windows),
-    ConfigCheck(("limits.slider", "can", "loop.rate_hz"), _simulated),
+    ConfigCheck(("limits.slider", "can", "loop.rate_hz", "drives"), _simulated),
 )

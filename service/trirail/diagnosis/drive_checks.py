@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Iterator
 from statistics import median
 
-from trirail_drivers.bus.load import HIGH_LOAD, Traffic
+from msgspec import Struct
+from trirail_drivers.bus.load import HIGH_LOAD, TrafficPlan, usage
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
@@ -99,31 +100,85 @@ def windows(config: Config) -> Iterator[Check]:
     yield Check("following error", "warning", finding, remedy, "drives.following_error")
 
 
-def traffic(config: Config) -> Traffic:
-    """Return the frames that a configuration puts on the bus."""
-    outputs = sum(bool(each.outputs) for each in config.drive_io)
-    return PROTOCOLS[config.drives.protocol].traffic.with_outputs(outputs)
+class BusUse(Struct, frozen=True):
+    """Use of the bus by the cycle, in the worst case, in a form for programs."""
+
+    channel: str
+    bitrate: int
+    """Bit rate [bit/s]."""
+    rate_hz: int
+    load: float
+    """Fraction of the bus capacity in use; 1.0 is a full bus."""
+    budget_us: float
+    """Part of each cycle that the bus leaves to the loop [µs]."""
+    setpoint_bytes: int
+    """Data length of a setpoint [bytes]."""
+    velocity_offset: bool
+    """True if the setpoints contain a velocity for feed-forward, in drives that accept one."""
+    load_with_velocity_offset: float | None
+    """Load that is the reason to leave the velocity offset out; None if it is not left out for this reason."""
+
+
+def plan_traffic(config: Config) -> TrafficPlan:
+    """Return the frames that a configuration puts on the bus if the drives have every optional object."""
+    protocol = PROTOCOLS[config.drives.protocol]
+    return protocol.plan_traffic(config.drives, config.drive_io, config.loop.rate_hz, config.can.bitrate)
+
+
+def bus_use(config: Config) -> BusUse:
+    """Return the expected use of the bus by a configuration."""
+    plan, can, rate = plan_traffic(config), config.can, config.loop.rate_hz
+    return BusUse(
+        channel=can.channel,
+        bitrate=can.bitrate,
+        rate_hz=rate,
+        load=plan.traffic.bus_load(rate, can.bitrate, config.drives.heartbeat),
+        budget_us=setpoint_budget_us(config),
+        setpoint_bytes=plan.setpoint_bytes,
+        velocity_offset=plan.velocity_offset,
+        load_with_velocity_offset=plan.full_load,
+    )
+
+
+def usage_of(config: Config, load: float) -> str:
+    """Return the share of the configured bus that the cycle uses in the worst case, such as "1 kHz uses 75 % of can0".
+
+    For a channel whose name says little, such as an address, the bus has no name.
+    """
+    return usage(config.loop.rate_hz, load, config.can.channel if config.can.interface == "socketcan" else "the bus")
 
 
 def setpoint_budget_us(config: Config) -> float:
     """Return the part of the cycle that the bus leaves to the loop [µs], as in trirail.wire.state.LoopState."""
-    share = traffic(config).bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat)
+    share = plan_traffic(config).traffic.bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat)
     return max(0.0, 1.0 - share) * config.period * 1e6
 
 
 def load(config: Config) -> Iterator[Check]:
     """Check the fraction of the bus capacity that the cycle uses in the worst case."""
     rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
-    frames = traffic(config)
+    plan = plan_traffic(config)
+    frames = plan.traffic
     share = frames.bus_load(rate, bitrate, drives.heartbeat)
-    left = f", which leaves {setpoint_budget_us(config):.0f} µs of each cycle to the loop" if share < 1.0 else ""
-    finding = f"{share:.0%} of {bitrate} bit/s at {rate} Hz{left}"
-    if share <= HIGH_LOAD:
+    left = f"{setpoint_budget_us(config):.0f} µs of each cycle are left to the loop" if share < 1.0 else ""
+    finding = f"{usage_of(config, share)} at {bitrate} bit/s"
+    finding = "; ".join(filter(None, (": ".join(filter(None, (finding, plan.omission))), left)))
+    if share > HIGH_LOAD:
+        highest = HIGH_LOAD * frames.highest_rate(bitrate, drives.heartbeat)
+        remedy = f"set loop.rate_hz below {highest:.0f}, or a higher bitrate"
+        remedy = "; or ".join(filter(None, (remedy, plan.remedy)))
+        yield Check("bus load", "failure" if share > 1.0 else "warning", finding, remedy, "loop.rate_hz")
+    elif plan.full_load is not None:
+        # The load minus the background is proportional to the rate.
+        background = frames.background(drives.heartbeat) / bitrate
+        highest = rate * (HIGH_LOAD - background) / (plan.full_load - background)
+        remedy = (
+            f"the drives follow with more lag; for the velocity offset, set loop.rate_hz below {highest:.0f}; "
+            'if the lag is acceptable, set drives.velocity_offset = "never"'
+        )
+        yield Check("bus load", "warning", finding, remedy, "drives.velocity_offset")
+    else:
         yield Check("bus load", "ok", finding)
-        return
-    highest = HIGH_LOAD * frames.highest_rate(bitrate, drives.heartbeat)
-    remedy = f"set loop.rate_hz below {highest:.0f}, or a higher bitrate"
-    yield Check("bus load", "failure" if share > 1.0 else "warning", finding, remedy, "loop.rate_hz")
 
 
 def _each(*keys: str) -> tuple[str, ...]:
@@ -135,5 +190,5 @@ CONFIG_CHECKS = (
     ConfigCheck((*_each("offset", "homing"), "limits.slider", "drives.quick_stop_deceleration", "geometry"), _zero),
     ConfigCheck(("drives.protocol", *_each("accept_without")), protections),
     ConfigCheck(("limits.slider.following_error", "drives.following_error"), windows),
-    ConfigCheck(("loop.rate_hz", "can.bitrate", "drives.protocol", "drives.heartbeat"), load),
+    ConfigCheck(("loop.rate_hz", "can.bitrate", "drives.protocol", "drives.heartbeat", "drives.velocity_offset"), load),
 )
