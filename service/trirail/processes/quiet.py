@@ -69,7 +69,7 @@ class Reached(IntEnum):
     """The cycle is complete, and a neighbour has called during the wait for the next tick."""
 
 
-GO_ON: Final = -1
+CONTINUE: Final = -1
 """Result of a stage of a cycle if the cycle continues with the next stage."""
 FOLLOW, HOLD, COMMAND = 0, 1, 2
 """Sources of the setpoints: FOLLOW for the measured positions, HOLD for a platform at rest, COMMAND for a motion."""
@@ -207,7 +207,7 @@ class OutputArrays(NamedTuple):
 
 def _typed(kind: type, *members: Any) -> Any:
     """Return the numba type of a named tuple of arrays."""
-    return types.BaseTuple.from_types(members, kind)
+    return types.BaseTuple.from_types(members, kind)  # type: ignore[no-untyped-call]
 
 
 _HEADERS = u8[:, ::1]
@@ -262,7 +262,7 @@ def _receive(s: Any, moment: NDArray[np.int64], frames: Exchange, t: float) -> b
 
 @compiled()
 def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours, frames: Exchange) -> int:
-    """Wait for the tick, and send the frames at the start of a cycle. Return GO_ON, or the stage that was reached."""
+    """Wait for the tick, and send the frames at the start of a cycle. Return CONTINUE, or the stage that was reached."""
     s, times = state[0], frames.times
     s.deadline_ns += s.period_ns
     if _wait(state, moment, neighbours.pollfds):
@@ -292,7 +292,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
         times[0].beat_due, times[0].next_beat = t + times[0].beat_period, (first + number) % len(frames.beats)
     begin_cycle(frames.axes, frames.history)
     _mark(state, moment, Part.SYNC)
-    return GO_ON
+    return CONTINUE
 
 
 @compiled()
@@ -303,7 +303,7 @@ def _read(
     frames: Exchange,
     feedback: NDArray[np.void],
 ) -> int:
-    """Read the drives' answers into `feedback`. Return GO_ON, or the reached stage if Python must do it."""
+    """Read the drives' answers into `feedback`. Return CONTINUE, or the reached stage if Python must do it."""
     s, pollfds, hearts, axes = state[0], neighbours.pollfds, neighbours.hearts, frames.axes
     s.called = called(pollfds)
     count = hearts[s.gateway_place]  # the same check as in trirail.processes.heartbeats.Watch
@@ -323,14 +323,14 @@ def _read(
         feedback[0].position[i] = axes[i].position
         feedback[0].age[i] = axes[i].syncs - axes[i].sampled
     _mark(state, moment, Part.MODE)
-    return GO_ON
+    return CONTINUE
 
 
 @compiled()
 def _solve(
     state: NDArray[np.void], moment: NDArray[np.int64], frames: Exchange, robot: RobotArrays, motion: MotionArrays
 ) -> int:
-    """Evaluate the feedback, and write the next setpoints into their frames. Return GO_ON, or the reached stage."""
+    """Evaluate the feedback, and write the next setpoints into their frames. Return CONTINUE, or the reached stage."""
     s = state[0]
     s.behind = cycle.observe(
         *(robot.legs, robot.feedback, robot.written, robot.backlash, s.period, s.fastest, s.limit, s.at_rest != 0),
@@ -346,7 +346,11 @@ def _solve(
             *(robot.legs, robot.bounds, motion.knots, motion.pieces, s.in_sliders != 0, motion.tools),
             *(motion.law_knots, motion.law_pieces, s.time, s.target),
             *(motion.furthest, s.course[0], s.course[1], s.course[2]),
-            *(robot.motion, robot.sliders, robot.backlash, robot.refused_values, robot.record),
+            robot.motion,
+            robot.sliders,
+            robot.backlash,
+            robot.refused_values,
+            robot.record,
         )
     elif s.source == HOLD:
         code = cycle.hold(
@@ -365,7 +369,7 @@ def _solve(
     late = _now_ns(state, moment) / 1e9 - s.synced > s.period
     if code >> 2 != 0 or late or not set_frames(frames.setpoints, frames.axes, robot.sliders[0]):
         return Reached.SOLVED
-    return GO_ON
+    return CONTINUE
 
 
 @compiled()
@@ -425,11 +429,11 @@ def run(
     s = state[0]
     while s.cycle < s.until and s.batched < len(neighbours.batch):
         reached = _begin(state, moment, neighbours, frames)
-        if reached == GO_ON:
+        if reached == CONTINUE:
             reached = _read(state, moment, neighbours, frames, robot.feedback)
-        if reached == GO_ON:
+        if reached == CONTINUE:
             reached = _solve(state, moment, frames, robot, motion)
-        if reached != GO_ON:
+        if reached != CONTINUE:
             return reached
         if not _switch_outputs(s, frames.axes, robot.record, motion, tables):
             return Reached.SOLVED

@@ -193,14 +193,36 @@ class QuietCycles:
         """Return the arguments of the compiled function that stay the same while the drives lend their tables."""
         measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
         frames = quiet.Exchange(
-            *(lent.bus, lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
-            *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
-            *(lent.outputs.frames, lent.outputs.headers, lent.expected, lent.axes, lent.times, lent.history),
+            bus=lent.bus,
+            arrived=lent.arrived.frames,
+            arrivals=lent.arrived.headers,
+            starts=lent.begin.frames,
+            begin=lent.begin.headers,
+            signs=lent.beats.frames,
+            beats=lent.beats.headers,
+            setpoints=lent.setpoints.frames,
+            departures=lent.end,
+            pins=lent.outputs.frames,
+            switchings=lent.outputs.headers,
+            expected=lent.expected,
+            axes=lent.axes,
+            times=lent.times,
+            history=lent.history,
         )
         robot = quiet.RobotArrays(
-            *(measured.legs, setpoints.bounds, schedule.motion, setpoints.sliders, measured.backlash),
-            *(setpoints.refused_values, measured.numbers, measured.written, measured.jumping, measured.scratch),
-            *(measured.settling.monitored, measured.record, measured.record.view(np.uint8)),
+            legs=measured.legs,
+            bounds=setpoints.bounds,
+            motion=schedule.motion,
+            sliders=setpoints.sliders,
+            backlash=measured.backlash,
+            refused_values=setpoints.refused_values,
+            feedback=measured.numbers,
+            written=measured.written,
+            jumps=measured.jumping,
+            scratch=measured.scratch,
+            monitored=measured.settling.monitored,
+            record=measured.record,
+            packed=measured.record.view(np.uint8),
         )
         neighbours = quiet.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
         return self._state, self._moment, neighbours, frames, robot
