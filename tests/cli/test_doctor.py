@@ -21,10 +21,10 @@ from trirail.config import SIM, Config, Tls, everything, load
 from trirail.diagnosis import Check, bare_loop, drive_checks
 from trirail.diagnosis.bare_loop import Cycles
 from trirail.errors import ServiceError
-from trirail_drivers.bus.frames import bits_of, frame_bits
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError
 from trirail_drivers.protocols import PROTOCOLS
+from trirail_drivers.timing import BusTiming, frame_bits
 
 CONFIGS = SIM.parent
 SIMULATED = load(SIM)
@@ -260,7 +260,14 @@ def test_what_passes_on_the_bus_is_counted_whoever_sends_it(frames: int, verdict
 @given(st.lists(st.integers(0, 8), max_size=50))
 def test_bits_are_those_of_the_frames_one_a_frame_at_most_too_many(lengths: list[int]) -> None:
     bits = sum(map(frame_bits, lengths))
-    assert bits <= bits_of(len(lengths), sum(lengths)) < bits + len(lengths) + 1
+    assert bits <= BusTiming(1).total_seconds(len(lengths), sum(lengths)) < bits + len(lengths) + 1
+
+
+@given(st.lists(st.integers(0, 16), max_size=50))
+def test_the_time_of_frames_of_can_fd_is_the_sum_of_theirs(lengths: list[int]) -> None:
+    timing = BusTiming(1_000_000, 5_000_000)
+    total = timing.total_seconds(len(lengths), sum(lengths))
+    assert total == pytest.approx(sum(map(timing.frame_ns, lengths)) * 1e-9)
 
 
 def test_the_kernels_counters_are_read_and_subtracted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -325,7 +332,7 @@ def test_the_bus_load_is_judged_as_the_driver_does(protocol: str, rate: int, bit
     config = changed(config, "loop", rate_hz=rate)
     clock = count(1000.0, 1e-6)
     bus = simulated_bus(config.can, config.drives, lambda: next(clock))
-    driver = PROTOCOLS[protocol].driver(bus, bitrate, config.drives, lambda: next(clock))
+    driver = PROTOCOLS[protocol].driver(bus, BusTiming(bitrate), config.drives, lambda: next(clock))
     check = next(drive_checks.load(config))
     refused = ""
     try:

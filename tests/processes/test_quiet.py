@@ -86,7 +86,7 @@ class Session:
         self.ends = Lockstep(carrier, folder, self)
         self._stack.callback(self.ends.close)
         self.driver = driver = PROTOCOLS[config.drives.protocol].driver(
-            self.ends.bus, config.can.bitrate, config.drives, self.clock_of_driver, None, config.drive_io
+            self.ends.bus, config.can.timing, config.drives, self.clock_of_driver, None, config.drive_io
         )
         self.setting_up = True
         driver.configure(config.period, config.limits.slider.velocities[0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final
 
-from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.load import Traffic
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.config import NO_IO, DigitalIo
@@ -195,17 +195,16 @@ def default_exchange(node: int, io: DigitalIo = NO_IO[0]) -> Exchange:
 def traffic(exchanges: Iterable[Exchange]) -> Traffic:
     """Return the bus traffic of the service and of the drives with these exchanges."""
     exchanges = tuple(exchanges)
-    cycle = frame_bits(0) + sum(
-        frame_bits(exchange.setpoints.size) + frame_bits(exchange.feedback.size) for exchange in exchanges
-    )
     repeated = [exchange.status_size for exchange in exchanges if exchange.status]
     repeated += [canopen_frames.INPUTS.size for exchange in exchanges if exchange.inputs not in (None, exchange.status)]
-    status = sum(map(frame_bits, repeated)) / canopen_frames.STATUS_PERIOD
-    polls = sum(2 * frame_bits(8) for exchange in exchanges if exchange.polled) / canopen_frames.POLL_PERIOD
-    lives = frame_bits(1) * (1 + sum(1 + exchange.guarded for exchange in exchanges))
+    polls = 2 * sum(exchange.polled for exchange in exchanges)
     return Traffic(
-        cycle_bits=cycle,
-        background=lambda heartbeat: status + polls + lives / heartbeat,
+        cycle=(0, *(size for exchange in exchanges for size in (exchange.setpoints.size, exchange.feedback.size))),
+        periodic=(
+            *((size, canopen_frames.STATUS_PERIOD) for size in repeated),
+            *(polls * ((8, canopen_frames.POLL_PERIOD),)),
+        ),
+        heartbeats=(1,) * (1 + sum(1 + exchange.guarded for exchange in exchanges)),
         most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
-        output_bits=canopen_frames.TRAFFIC.output_bits,
+        output=canopen_frames.TRAFFIC.output,
     ).with_outputs(sum(exchange.outputs is not None for exchange in exchanges))

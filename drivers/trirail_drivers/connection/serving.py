@@ -13,8 +13,9 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from trirail_drivers import config
-from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.can_frame import CAN_FRAME, CANFD_FRAME, DATA_AT, FRAME_SIZES, HEADER
 from trirail_drivers.bus.frame_io import SO_TIMESTAMPNS, TIMESPEC, TIMESPEC_SPACE
+from trirail_drivers.bus.frames import fd_packed
 from trirail_drivers.bus.unixbus import widen_send_buffer
 from trirail_drivers.connection.opening import simulated_drives
 from trirail_drivers.protocols import PROTOCOLS
@@ -46,7 +47,7 @@ def serve(
         unready.rename(path)
         accepted, _ = listening.accept()
     with accepted:
-        master = _Master(accepted, states)
+        master = _Master(accepted, states, fd=section.fd)
         connected()
         with contextlib.suppress(ConnectionError):
             master.exchange(SimulatedExchange(devices, master.clock, faults, master.emit))
@@ -60,8 +61,12 @@ class _Master:
     answer, only the newest is sent, at the end: otherwise the master would take an old position for a current one.
     """
 
-    def __init__(self, connection: socket.socket, states: Collection[int]) -> None:
-        """`states` contains the identifiers of frames that a newer frame with the same identifier replaces."""
+    def __init__(self, connection: socket.socket, states: Collection[int], *, fd: bool) -> None:
+        """`states` contains the identifiers of frames that a newer frame with the same identifier replaces.
+
+        If `fd`, the drives send CAN FD frames.
+        """
+        self._fd = fd
         self._socket = connection
         self._states = states
         self._held: dict[int, bytes] = {}
@@ -79,6 +84,8 @@ class _Master:
     def emit(self, identifier: int, data: bytes) -> None:
         """Send a drive's frame; a state frame is sent only after the waiting frames of the master."""
         frame = CAN_FRAME.pack(identifier, len(data), data)
+        if self._fd:
+            frame = fd_packed(frame)
         if identifier in self._states:
             self._held[identifier] = frame
         else:
@@ -86,8 +93,8 @@ class _Master:
 
     def exchange(self, drives: SimulatedExchange) -> None:
         """Pass frames and time to the drives until the master disconnects."""
-        packet = bytearray(CAN_FRAME.size)
-        receive, buffers, unpack = self._socket.recvmsg_into, [packet], CAN_FRAME.unpack
+        packet = bytearray(CANFD_FRAME.size)
+        receive, buffers, unpack = self._socket.recvmsg_into, [packet], HEADER.unpack_from
         due = self._now
         while True:
             try:
@@ -96,14 +103,14 @@ class _Master:
                 self._send_held()
                 now = time.monotonic()
             else:
-                if size != CAN_FRAME.size:
+                if size not in FRAME_SIZES:
                     return
                 seconds, nanoseconds = TIMESPEC.unpack(stamped[0][2])
                 waited = time.time() - seconds - nanoseconds * 1e-9
                 now = max(self._now, time.monotonic() - max(0.0, waited))
-                identifier, length, data = unpack(packet)
+                identifier, length = unpack(packet)
                 self._now = now
-                drives.receive(identifier, data[:length], now)
+                drives.receive(identifier, bytes(packet[DATA_AT : DATA_AT + length]), now)
             if now >= due:
                 due = now + POLL_PERIOD_S
                 self._now = now

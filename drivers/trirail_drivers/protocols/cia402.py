@@ -68,6 +68,7 @@ CIA402 = Protocol(
     restore=restore,
     protections={name: describe_protection(name) for name in PROTECTIONS},
     without_io="",
+    without_fd="",
     states=lambda node: {canopen_frames.TPDO1 + node, canopen_frames.TPDO2 + node},
     fault_frames={
         "nmt": Frames(True, canopen_frames.NMT),

@@ -45,6 +45,7 @@ ODRIVE = Protocol(
     restore=None,
     protections={name: describe_protection(name) for name in PROTECTIONS},
     without_io="CANSimple has no message for an ODrive's GPIO",
+    without_fd="the driver requests each position by a remote frame, which CAN FD does not have",
     states=lambda node: {
         cansimple.identifier(node, cansimple.HEARTBEAT),
         cansimple.identifier(node, cansimple.GET_ENCODER_ESTIMATES),

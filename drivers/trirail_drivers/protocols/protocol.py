@@ -25,7 +25,7 @@ class Protocol:
     name: str
     """Name in `drives.protocol` of the configuration."""
     driver: Callable[..., DriveGroup]
-    """Function that returns the driver of three drives. Arguments: the bus, its bit rate, section [drives], the clock,
+    """Function that returns the driver of three drives. Arguments: the bus, its BusTiming, section [drives], the clock,
     a Reopening if a lost bus can be reopened, and the digital outputs and inputs of each drive.
     """
     rules: Callable[[config.Drives, Requirements], Iterator[Rule]]
@@ -61,6 +61,8 @@ class Protocol:
     """
     without_io: str
     """Reason why the drives have no digital outputs and inputs in the cycle; "" if they have them."""
+    without_fd: str
+    """Reason why the drives cannot be used on a CAN FD bus; "" if they can."""
     states: Callable[[int], set[int]]
     """Function that returns the CAN identifiers of the state frames of a node."""
     fault_frames: Mapping[str, Frames]

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from statistics import median
 
 from trirail_drivers.bus.load import HIGH_LOAD, Traffic
+from trirail_drivers.config import Can
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
@@ -18,6 +19,7 @@ MAX_SCALE_RATIO = 8.0
 """Greatest plausible ratio between the scales of two drives of one robot."""
 _NUMBERS = ("counts_per_metre", "revolutions_per_metre")
 _UNITS = ("velocity_unit", "acceleration_unit")
+_BUS = ("can.bitrate", "can.fd", "can.data_bitrate")
 
 
 def _alike(config: Config) -> Iterator[Check]:
@@ -107,22 +109,27 @@ def traffic(config: Config) -> Traffic:
 
 def setpoint_budget_us(config: Config) -> float:
     """Return the part of the cycle that the bus leaves to the loop [µs], as in trirail.wire.state.LoopState."""
-    share = traffic(config).bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat)
+    share = traffic(config).bus_load(config.loop.rate_hz, config.can.timing, config.drives.heartbeat)
     return max(0.0, 1.0 - share) * config.period * 1e6
+
+
+def _faster(section: Can) -> str:
+    """Return the setting of the bus that lets its frames take less time."""
+    return "a higher data_bitrate" if section.fd else "a higher bitrate"
 
 
 def load(config: Config) -> Iterator[Check]:
     """Check the fraction of the bus capacity that the cycle uses in the worst case."""
-    rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
+    rate, timing, drives = config.loop.rate_hz, config.can.timing, config.drives
     frames = traffic(config)
-    share = frames.bus_load(rate, bitrate, drives.heartbeat)
+    share = frames.bus_load(rate, timing, drives.heartbeat)
     left = f", which leaves {setpoint_budget_us(config):.0f} µs of each cycle to the loop" if share < 1.0 else ""
-    finding = f"{share:.0%} of {bitrate} bit/s at {rate} Hz{left}"
+    finding = f"{share:.0%} of {timing} at {rate} Hz{left}"
     if share <= HIGH_LOAD:
         yield Check("bus load", "ok", finding)
         return
-    highest = HIGH_LOAD * frames.highest_rate(bitrate, drives.heartbeat)
-    remedy = f"set loop.rate_hz below {highest:.0f}, or a higher bitrate"
+    highest = HIGH_LOAD * frames.highest_rate(timing, drives.heartbeat)
+    remedy = f"set loop.rate_hz below {highest:.0f}, or {_faster(config.can)}"
     yield Check("bus load", "failure" if share > 1.0 else "warning", finding, remedy, "loop.rate_hz")
 
 
@@ -135,5 +142,5 @@ CONFIG_CHECKS = (
     ConfigCheck((*_each("offset", "homing"), "limits.slider", "drives.quick_stop_deceleration", "geometry"), _zero),
     ConfigCheck(("drives.protocol", *_each("accept_without")), protections),
     ConfigCheck(("limits.slider.following_error", "drives.following_error"), windows),
-    ConfigCheck(("loop.rate_hz", "can.bitrate", "drives.protocol", "drives.heartbeat"), load),
+    ConfigCheck(("loop.rate_hz", *_BUS, "drives.protocol", "drives.heartbeat"), load),
 )
