@@ -37,8 +37,6 @@ def serve(
     The path appears once the socket accepts connections. `ready` is called just before the path appears, `connected`
     when the client has connected.
     """
-    devices, faults = simulated_drives(section, drives)
-    states = frozenset[int]().union(*(PROTOCOLS[drives.protocol].states(each.node) for each in devices))
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listening:
         unready = path.with_name(f"{path.name}.new")
         listening.bind(str(unready))
@@ -47,10 +45,22 @@ def serve(
         unready.rename(path)
         accepted, _ = listening.accept()
     with accepted:
-        master = _Master(accepted, states, fd=section.fd)
-        connected()
-        with contextlib.suppress(ConnectionError):
-            master.exchange(SimulatedExchange(devices, master.clock, faults, master.emit))
+        exchange(accepted, section, drives, connected)
+
+
+def exchange(
+    connection: socket.socket, section: config.Can, drives: config.Drives, connected: Callable[[], None]
+) -> None:
+    """Connect the drives of a configuration to a master over a socket, which may also be a SocketCAN socket.
+
+    `connected` is called when frames can be received. Return when the other end has disconnected.
+    """
+    devices, faults = simulated_drives(section, drives)
+    states = frozenset[int]().union(*(PROTOCOLS[drives.protocol].states(each.node) for each in devices))
+    master = _Master(connection, states, fd=section.fd)
+    connected()
+    with contextlib.suppress(ConnectionError):
+        master.exchange(SimulatedExchange(devices, master.clock, faults, master.emit))
 
 
 class _Master:
