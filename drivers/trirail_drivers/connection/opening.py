@@ -188,7 +188,7 @@ def _problem(section: config.Can) -> str:
     folder = NETWORK_INTERFACES / section.channel
     try:
         flags = int((folder / "flags").read_text(), 16)
-        mtu = int((folder / "mtu").read_text())
+        mtu = int((folder / "mtu").read_text()) if section.fd else 0
         carrier = int((folder / "carrier").read_text()) if flags & IFF_UP else 0
     except (OSError, ValueError):
         return ""

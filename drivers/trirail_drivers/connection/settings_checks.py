@@ -17,7 +17,7 @@ _OWN_INTERFACES = ("simulated", "unix")
 _RESERVED_OPTIONS = ("interface", "channel", "bitrate", "fd", "data_bitrate", "ignore_config", "config_context")
 """Arguments of `can.Bus` that are set from other keys or must not be set."""
 MAX_CLASSICAL_BITRATE = 1_000_000
-"""Highest bit rate of classical CAN (ISO 11898-2) [bit/s]."""
+"""Highest bit rate of classical CAN, and of the arbitration of CAN FD (ISO 11898-2) [bit/s]."""
 
 
 def bus_rules(section: Can, protocol: str) -> Iterator[Rule]:
@@ -56,8 +56,8 @@ def files(drives: Drives) -> Iterator[Rule]:
 def _check_bitrate(section: Can) -> None:
     if section.bitrate > MAX_CLASSICAL_BITRATE and section.interface not in _OWN_INTERFACES:
         raise DriveError(
-            f"can.bitrate = {section.bitrate}: the maximum of classical CAN and of CAN FD's arbitration is "
-            f"{MAX_CLASSICAL_BITRATE} bit/s; only {' and '.join(_OWN_INTERFACES)}, which have no wire, may exceed it"
+            f"can.bitrate = {section.bitrate}: the maximum of classical CAN is {MAX_CLASSICAL_BITRATE} bit/s; "
+            f"only {' and '.join(_OWN_INTERFACES)}, which have no wire, may exceed it"
         )
 
 
