@@ -5,7 +5,8 @@ make hil                          the same, and installs missing packages if pos
 
 In the machine, tools/hil_guest.py runs the service on can0, virtual drives on can1, and a client. Then it runs a second
 service on vcan0 at another rate, with one drive that is homed and one third-party drive. Then tools/hil_fd.py runs a
-service at 2 kHz on vcan1 as a CAN FD bus, and pytest runs the tests marked vcan. `--only` runs one of these steps. Outside the machine, tools/bus_log.py and Wireshark's dissector check the frames on both buses.
+service at 2 kHz on vcan1 as a CAN FD bus, and pytest runs the tests marked vcan. `--only` runs one of these steps.
+Outside the machine, tools/bus_log.py and Wireshark's dissector check the frames on the buses.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 python tools/hil_fd.py drives CONFIG CHANNEL    simulated drives on a SocketCAN interface, until SIGTERM
 python tools/hil_fd.py guest FOLDER             in the machine; FOLDER has fd.toml, and receives logs and fd.json
 
-The emulated processor is too slow to keep 2 kHz, so the service misses ticks. They are counted and reported; every frame
-must nevertheless be a CAN FD frame with bit rate switch, and every setpoint must be correct.
+The emulated processor is too slow to keep 2 kHz, so the service misses ticks, which are counted and reported. Every
+frame must nevertheless be a CAN FD frame with bit rate switch, and every setpoint must be correct.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from hil_programs import STEP_TIMEOUT_S, Failed, Machine
+from hil_programs import STEP_TIMEOUT_S, Failed, Machine, wait_until
 
 if TYPE_CHECKING:
+    from trirail.client.client import Robot
     from trirail.config import Config
 
 CHANNEL = "vcan1"
@@ -35,7 +36,7 @@ CHANGES = {
     'name = "robot"': 'name = "fd"',
     "rate_hz = 20 ": f"rate_hz = {RATE_HZ} ",
     'channel = "can0"': f'channel = "{CHANNEL}"\nfd = true',
-    # A stall of the machine lasts many cycles of 0.5 ms, in which the service hears no drive and the drives hear no SYNC.
+    # A stall of the machine lasts many cycles of 0.5 ms, without positions for the service and SYNCs for the drives.
     "missed_syncs = 40": "missed_syncs = 20_000",
     "[drives]\n": "[drives]\nmissed_positions = 1000\n",
     "max_overruns = 10 ": "max_overruns = 20_000 ",
@@ -112,6 +113,22 @@ def drives(config: Path, channel: str) -> None:
         exchange(carrier, loaded.can, loaded.drives, lambda: print("A, B, C on", channel, flush=True))
 
 
+def _connected(config: Config) -> Robot:
+    """Connect to the service, which may be too busy to answer at first. Raises Failed."""
+    from trirail.client.client import Robot
+    from trirail.errors import ServiceError
+
+    robots: list[Robot] = []
+
+    def connect() -> bool:
+        with contextlib.suppress(ServiceError):
+            robots.append(Robot(config.robot.name, config.zenoh.listen[0]))
+        return bool(robots)
+
+    wait_until(connect, "the service answers")
+    return robots[0]
+
+
 def guest(folder: Path) -> int:
     """Run the robot in the machine; write the log and fd.json; return the exit code."""
     memory, began = Path(os.environ["TMPDIR"]), time.monotonic()
@@ -123,20 +140,21 @@ def guest(folder: Path) -> int:
     try:
         with Machine(folder, memory) as machine:
             machine.candump(CHANNEL, LOG)
+            # Without real-time priority, since the loop alone takes one of the two processors. The drives would take
+            # the other one from the gateway and the client.
             program = machine.start(
-                "fd-drives",
-                *("chrt", "--fifo", "50", sys.executable, "tools/hil_fd.py", "drives", folder / "fd.toml", CHANNEL),
+                "fd-drives", sys.executable, "tools/hil_fd.py", "drives", folder / "fd.toml", CHANNEL
             )
             service = machine.begin_service("fd.toml", "fd-service")
             import hil_scenario
-            from trirail.client.client import Robot
             from trirail.config import load
 
             config = load(folder / "fd.toml")
             machine.await_drives(program, "fd-drives")
             machine.await_service(service, "fd-service")
             held("service", f"up on {CHANNEL} at {RATE_HZ} Hz, CAN FD")
-            with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
+            with contextlib.ExitStack() as stack:
+                robot = stack.enter_context(_connected(config))
                 hil_scenario.recover(robot)
                 held("enable", "confirmed, the robot holds")
                 moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(STEP_TIMEOUT_S)

@@ -117,7 +117,8 @@ def script(folder: Path, packed: tuple[Path, ...], steps: Collection[str] = STEP
     commands = {
         "robots": f"{sys.executable} tools/hil_guest.py {folder}",
         "fd": f"{sys.executable} tools/hil_fd.py guest {folder}",
-        "tests": f"""export PYTEST_DISABLE_PLUGIN_AUTOLOAD=1  # hypothesis alone takes a quarter of a minute to be loaded
+        # Hypothesis, which no test of these needs as a plug-in, alone takes a quarter of a minute to be loaded.
+        "tests": f"""export PYTEST_DISABLE_PLUGIN_AUTOLOAD=1
 options='-p pytest_timeout -p no:cacheprovider --noconftest -m vcan -rA --tb=short'
 {sys.executable} -m pytest $options {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log
 echo ${{PIPESTATUS[0]}} > {folder}/vcan.code

@@ -67,6 +67,7 @@ def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
         for end in ends:
             stack.enter_context(end)
             end.settimeout(10.0)
+        ends[0].setblocking(False)
         yield ends
 
 
@@ -232,6 +233,7 @@ def test_simulated_drives_answer_with_frames_of_can_fd() -> None:
 def test_served_drives_answer_in_the_format_of_their_bus(fd: bool) -> None:
     """Whatever the format of what they are asked in."""
     with pair() as (near, far):
+        near.settimeout(10.0)
         thread = threading.Thread(
             target=serving.exchange, args=(far, Can("unix", fd=fd), DRIVES, lambda: None), daemon=True
         )
