@@ -4,9 +4,9 @@ python tools/hil.py               boots Debian's kernel in QEMU with two CAN car
 make hil                          the same, and installs missing packages if possible
 
 In the machine, tools/hil_guest.py runs the service on can0, virtual drives on can1, and a client. Then it runs a second
-service on vcan0 at another rate, with one drive that is homed and one third-party drive. Then tools/hil_fd.py runs a
-service at 2 kHz on vcan1 as a CAN FD bus, and pytest runs the tests marked vcan. `--only` runs one of these steps.
-Outside the machine, tools/bus_log.py and Wireshark's dissector check the frames on the buses.
+service on vcan0 at another rate, with one drive that is homed and one third-party drive. Then pytest runs the tests
+marked vcan. Outside the machine, tools/bus_log.py and Wireshark's dissector check the frames on both buses. `--only fd`
+runs tools/hil_fd.py instead: a service at 2 kHz on vcan1 as a CAN FD bus.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import hil_fd
 import hil_programs
 import hil_second
 from hil_dissector import Dissected
-from hil_machine import ROOT, STEPS, compiling, machine, output_lines, pack
+from hil_machine import DEFAULT_STEPS, ROOT, STEPS, compiling, machine, output_lines, pack
 from hil_needs import Failed, install, last, requirements
 from trirail.config import Config, load
 
@@ -73,7 +73,7 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, _interrupt)
     say = Progress(sys.stderr if options.json else sys.stdout)
-    steps = STEPS if options.only is None else (options.only,)
+    steps = DEFAULT_STEPS if options.only is None else (options.only,)
     report: dict[str, Any] = {"ok": False, "checks": {}, "failure": None, "not_shown": NOT_SHOWN}
     folder: Path | None = None
     try:
