@@ -153,7 +153,7 @@ def test_data_frames_leave_as_frames_of_can_fd_and_others_do_not(captured: bool,
         assert far.recv(100) == bytes(Frame(0x701, remote=True).packed)
         far.send(Frame(0x581, b"\7").packed)
         far.send(fd_packed(Frame(0x582, b"\x08").packed))
-        assert [frames.receive(), frames.receive()] == [(0x581, b"\7"), (0x582, b"\x08")]
+        assert [frames.receive(), frames.receive()] == [(0x581, bytearray(b"\7")), (0x582, bytearray(b"\x08"))]
     if captured:
         assert logged(capture, tmp_path) == ["201##10102", "202##103", "701#R", "581#07", "582##108"]
 

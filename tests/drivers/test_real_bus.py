@@ -173,7 +173,7 @@ def test_frames_of_can_fd_pass_between_two_sockets_of_the_kernel() -> None:
         assert isinstance(frames, SocketFrames)
         frames.set_identifiers({0x123})
         one.send(Frame(0x123, b"\1\2").message())
-        assert frames.receive(60.0) == (0x123, b"\1\2")
+        assert frames.receive(60.0) == (0x123, bytearray(b"\1\2"))
         frames.send(Frame(0x124, b"\3"))
         arrived = one.recv(60.0)
         assert arrived is not None
