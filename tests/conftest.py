@@ -97,7 +97,7 @@ class Rig(ControlRig):
         self._send = self.bus.send
         self.bus.send = self._note  # type: ignore[assignment,method-assign]
         driver = PROTOCOLS[config.drives.protocol].driver(
-            self.bus, config.can.bitrate, config.drives, lambda: self.now, None, config.drive_io
+            self.bus, config.can.timing, config.drives, lambda: self.now, None, config.drive_io
         )
         driver.configure(config.period)
         if delay is not None:

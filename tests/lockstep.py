@@ -1,7 +1,7 @@
 """Buses whose two ends take turns: what the service sends waits until the test brings it to the drives.
 
 "unix" is the bus between processes, a socket of `struct can_frame`; "captured" the same with every frame noted down;
-"virtual" is python-can's, which stands for every interface that has no such socket.
+"fd" is the same as a CAN FD bus; "virtual" is python-can's, which stands for every interface that has no such socket.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from typing import Final, Protocol
 
 import can
 from can.interfaces.virtual import VirtualBus
-from trirail_drivers.bus.can_frame import CAN_FRAME, STANDARD_BITS
+from trirail_drivers.bus.can_frame import CAN_FRAME, CANFD_FRAME, STANDARD_BITS
 from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.bus.unixbus import UnixBus
 
 CARRIERS: Final = ("unix", "captured", "virtual")
+"""Buses of classical CAN."""
 STEP_NS: Final = 200_000
 """How time passes for who waits."""
 FILLER: Final = CAN_FRAME.pack(STANDARD_BITS, 0, b"")
@@ -120,7 +121,7 @@ class Lockstep:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listening:
             listening.bind(str(folder / "can"))
             listening.listen()
-            bus = WaitingUnix(str(folder / "can"))
+            bus = WaitingUnix(str(folder / "can"), fd=carrier == "fd")
             bus.time = time
             end, _ = listening.accept()
         end.setblocking(False)
@@ -129,7 +130,7 @@ class Lockstep:
 
         def take() -> bytes | None:
             with contextlib.suppress(BlockingIOError):
-                while (packet := end.recv(CAN_FRAME.size)) == FILLER:
+                while (packet := end.recv(CANFD_FRAME.size)) == FILLER:
                     pass
                 return packet
             return None
@@ -140,7 +141,7 @@ class Lockstep:
                 while True:
                     bus.carrier.send(FILLER, socket.MSG_DONTWAIT)
             for _ in range(frames):
-                assert end.recv(CAN_FRAME.size) == FILLER
+                assert end.recv(CANFD_FRAME.size) == FILLER
 
         def say(packet: bytes) -> None:
             end.send(packet)

@@ -15,6 +15,7 @@ from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, PowerSta
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import Frames, Servo, SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.faults import Faults
+from trirail_drivers.timing import BusTiming
 
 STEP: Final = 0.001
 """The period of a driver's cycle, and how time passes for who waits [s]."""
@@ -192,7 +193,7 @@ class DriverRig(Cycles[AnyDriver], ABC, Generic[AnyDevice, AnyDriver]):
     def __init__(
         self,
         drives: config.Drives,
-        driver: Callable[[can.BusABC, int, config.Drives, Callable[[], float]], AnyDriver],
+        driver: Callable[[can.BusABC, BusTiming, config.Drives, Callable[[], float]], AnyDriver],
     ) -> None:
         self.config = drives
         self.clock = Clock()
@@ -201,7 +202,7 @@ class DriverRig(Cycles[AnyDriver], ABC, Generic[AnyDevice, AnyDriver]):
             for drive, start in zip(drives.each, START, strict=True)
         ]
         self.bus = Bus(self.devices, self.clock, PROTOCOLS[drives.protocol].fault_frames)
-        self.drives = driver(self.bus, 1_000_000, drives, self.clock)
+        self.drives = driver(self.bus, BusTiming(1_000_000), drives, self.clock)
 
     @abstractmethod
     def device(self, drive: config.Drive, counts: float) -> AnyDevice:

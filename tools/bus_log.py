@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 from can import CanutilsLogReader
 from trirail.config import Config
-from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.config import Drive
 from trirail_drivers.interface import NAMES
+from trirail_drivers.timing import BusTiming
 
 HELD = {
     "SYNC": "every SYNC is a tick of the period: none too early, none in a burst, none but the missed ones lacking",
@@ -62,8 +62,6 @@ ASKED_BY = {
 }
 """Controlwords that command each transition of CiA 402; None for a transition that a drive makes by itself."""
 
-MAX_FRAME_BITS = frame_bits(8)
-"""Worst-case length of a frame [bits]: 135 µs at 1 Mbit/s."""
 GRID_TOLERANCE = 1e-3
 """Rounding of timestamps and of the grid of ticks, as a fraction of the period."""
 
@@ -101,7 +99,7 @@ def problems(log: Sequence[Frame], config: Config, missed: int, until: float) ->
     """Return the errors in the frames before the time `until`, one line each; `missed` ticks were reported missing."""
     log = [frame for frame in log if frame.t < until]
     lines = [*sync_problems(log, config.period, missed, until), *order_problems(log)]
-    lines += gap_problems(log, config.period, config.can.bitrate, config.drives.master_node)
+    lines += gap_problems(log, config.period, config.can.timing, config.drives.master_node)
     for name, drive in zip(NAMES, config.drives.each, strict=True):
         lines += (f"drive {name}: {problem}" for problem in _setpoint_problems(log, drive, config))
         lines += (f"drive {name}: {problem}" for problem in _power_problems(log, drive.node))
@@ -190,7 +188,7 @@ def order_problems(log: Sequence[Frame]) -> Iterator[str]:
             request = None
 
 
-def gap_problems(log: Sequence[Frame], period: float, bitrate: int, master: int) -> Iterator[str]:
+def gap_problems(log: Sequence[Frame], period: float, timing: BusTiming, master: int) -> Iterator[str]:
     """Yield the service's frames that are sent in the frame time before a tick, or after it and before its SYNC.
 
     Such a frame can still be on the bus at the time of the SYNC, and would delay it. The ticks are not in the log: each
@@ -201,8 +199,8 @@ def gap_problems(log: Sequence[Frame], period: float, bitrate: int, master: int)
     ----------
     period
         Period [s].
-    bitrate
-        Bit rate [bit/s].
+    timing
+        Bit rates of the bus.
     master
         Node id of the service.
 
@@ -212,7 +210,7 @@ def gap_problems(log: Sequence[Frame], period: float, bitrate: int, master: int)
         return
     began = syncs[0]
     began += min(t - began - round((t - began) / period) * period for t in syncs)
-    frame_time = MAX_FRAME_BITS / bitrate
+    frame_time = timing.frame_ns(8) * 1e-9
     for cycle in _cycles(log):
         number = math.floor((cycle[0].t - began) / period + GRID_TOLERANCE)
         latest = began + (number + 1) * period - frame_time

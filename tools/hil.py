@@ -5,7 +5,8 @@ make hil                          the same, and installs missing packages if pos
 
 In the machine, tools/hil_guest.py runs the service on can0, virtual drives on can1, and a client. Then it runs a second
 service on vcan0 at another rate, with one drive that is homed and one third-party drive. Then pytest runs the tests
-marked vcan. Outside the machine, tools/bus_log.py and Wireshark's dissector check the frames on both buses.
+marked vcan. Outside the machine, tools/bus_log.py and Wireshark's dissector check the frames on both buses. `--only fd`
+runs tools/hil_fd.py instead: a service at 2 kHz on vcan1 as a CAN FD bus.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ from typing import Any
 
 import bus_log
 import hil_dissector
+import hil_fd
+import hil_programs
 import hil_second
 from hil_dissector import Dissected
-from hil_machine import ROOT, compiling, machine, output_lines, pack
+from hil_machine import DEFAULT_STEPS, ROOT, STEPS, compiling, machine, output_lines, pack
 from hil_needs import Failed, install, last, requirements
 from trirail.config import Config, load
 
@@ -64,11 +67,13 @@ def main() -> int:
     parser.add_argument("--install", action="store_true", help="install missing Debian packages first (as root)")
     parser.add_argument("--timeout", type=float, default=1500.0, help="of the whole run [s]; default 1500")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where to leave the logs")
+    parser.add_argument("--only", choices=STEPS, help="run only one step: two robots, a robot on CAN FD, or the tests")
     parser.add_argument("--json", action="store_true", help="print one JSON object; progress goes to standard error")
     options = parser.parse_args()
 
     signal.signal(signal.SIGTERM, _interrupt)
     say = Progress(sys.stderr if options.json else sys.stdout)
+    steps = DEFAULT_STEPS if options.only is None else (options.only,)
     report: dict[str, Any] = {"ok": False, "checks": {}, "failure": None, "not_shown": NOT_SHOWN}
     folder: Path | None = None
     try:
@@ -79,12 +84,12 @@ def main() -> int:
         folder.mkdir(parents=True, exist_ok=True)
         deadline = time.monotonic() + options.timeout
         try:
-            run(folder.resolve(), kernel, deadline, say, report)
+            run(folder.resolve(), kernel, deadline, say, report, steps)
         except Stalled as stalled:
             say(f"once more, for {stalled}")
             again = folder / "again"
             again.mkdir(exist_ok=True)
-            run(again.resolve(), kernel, deadline, say, report)
+            run(again.resolve(), kernel, deadline, say, report, steps)
         report["ok"] = True
     except Failed as failed:
         report["failure"] = str(failed)
@@ -122,8 +127,10 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict[str, Any]) -> None:
-    """Boot the machine, run both robots and the tests in it, and check the frames.
+def run(
+    folder: Path, kernel: Path, deadline: float, say: Progress, report: dict[str, Any], steps: Sequence[str]
+) -> None:
+    """Boot the machine, run these steps in it, and check the frames.
 
     Raises Failed, or Stalled if a second attempt may succeed.
     """
@@ -132,9 +139,26 @@ def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict
     with compiling(folder):
         packed = pack(folder)
         say(f"booting {kernel.name} in QEMU; logs are in {folder}")
-        with machine(folder, kernel, packed) as lines:
+        with machine(folder, kernel, packed, steps) as lines:
             for line in output_lines(lines, deadline):
                 say(line)
+    if "fd" in steps:
+        try:
+            report["fd"] = hil_fd.check(folder, load(folder / "fd.toml"))
+        except hil_programs.Failed as failed:
+            raise Failed(f"{failed}{_logs(folder, 'fd-service', 'fd-drives')}") from None
+        report["checks"]["fd"] = hil_fd.HELD
+        loop = report["fd"]["loop"]
+        say(f"CAN FD: {hil_fd.HELD}; {loop['overruns']} ticks missed, {loop['cycles']} cycles of {hil_fd.RATE_HZ} Hz")
+        say(f"CAN FD: {json.dumps(report['fd'])}")
+    if "tests" in steps:
+        _judge_tests(folder, say, report)
+    if "robots" in steps:
+        _judge_robots(folder, config, say, report)
+
+
+def _judge_robots(folder: Path, config: Config, say: Progress, report: dict[str, Any]) -> None:
+    """Check what both robots did. Raises Failed, or Stalled if a second attempt may succeed."""
     result = _result(folder)
     report["checks"] |= result["checks"]
     report["lost"] = result["lost"]
@@ -150,6 +174,12 @@ def judge(folder: Path, config: Config, result: dict[str, Any], say: Progress, r
     """Check the results from the machine. Raises Failed."""
     if result["failure"]:
         raise Failed(f"{result['failure']}{_logs(folder, *LOGS)}")
+    report["loops"] = result["loops"]
+    check_frames(folder, config, result, say, report)
+
+
+def _judge_tests(folder: Path, say: Progress, report: dict[str, Any]) -> None:
+    """Check the outcome of the tests marked vcan. Raises Failed."""
     code = (folder / "vcan.code").read_text().strip() if (folder / "vcan.code").exists() else "none"
     summary = last((folder / "vcan.log").read_text(), 1) if (folder / "vcan.log").exists() else ""
     if code != "0" or "passed" not in summary:
@@ -159,8 +189,6 @@ def judge(folder: Path, config: Config, result: dict[str, Any], say: Progress, r
     price = _price(folder)
     say(f"a cycle's frames: {price['socket_us']['p50']:.0f} µs, by python-can {price['ratio']:.1f} times as much")
     report["price"] = price
-    report["loops"] = result["loops"]
-    check_frames(folder, config, result, say, report)
 
 
 def configure(folder: Path) -> Config:
@@ -183,7 +211,9 @@ def configure(folder: Path) -> Config:
     (folder / "robot.toml").write_text(text)
     (folder / "second.toml").write_text(hil_second.configure(text))
     (folder / "second.faults").write_text(hil_second.FAULTS)
+    (folder / "fd.toml").write_text(hil_fd.configure(text))
     load(folder / "second.toml")
+    load(folder / "fd.toml")
     return load(folder / "robot.toml")
 
 

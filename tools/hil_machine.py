@@ -11,7 +11,7 @@ import sys
 import sysconfig
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from hil_needs import BIN, MODULES, SEARCH, Failed, busybox, last
@@ -26,6 +26,14 @@ would also take minutes to compile itself.
 
 TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py", "tests/diagnosis/test_bus_timing.py")
 """Files with tests marked vcan."""
+
+STEPS = "robots", "fd", "tests"
+"""Steps in the machine: two robots on classical CAN, a robot on CAN FD, and the tests marked vcan."""
+
+DEFAULT_STEPS = "robots", "tests"
+"""Steps without the robot on CAN FD: at 2 kHz, simulated drives need a processor that is not emulated, otherwise they
+answer too late and the service reports them as lost.
+"""
 
 COMPILED = "compiled"
 """Name of the file with the outcome of compiling. The machine waits for this file."""
@@ -109,8 +117,19 @@ def can_interface(name: str) -> str:
     return "\n".join([setting, *(f"{line[1:]} || true" if line.startswith("-") else line for line in commands)])
 
 
-def script(folder: Path, packed: tuple[Path, ...]) -> str:
-    """Return the shell script that the machine runs as root."""
+def script(folder: Path, packed: tuple[Path, ...], steps: Collection[str] = DEFAULT_STEPS) -> str:
+    """Return the shell script that the machine runs as root, with some of its STEPS."""
+    commands = {
+        "robots": f"{sys.executable} tools/hil_guest.py {folder}",
+        "fd": f"{sys.executable} tools/hil_fd.py guest {folder}",
+        # Hypothesis, which no test of these needs as a plug-in, alone takes a quarter of a minute to be loaded.
+        "tests": f"""export PYTEST_DISABLE_PLUGIN_AUTOLOAD=1
+options='-p pytest_timeout -p no:cacheprovider --noconftest -m vcan -rA --tb=short'
+{sys.executable} -m pytest $options {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log
+echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
+{sys.executable} tools/bench.py frames --cycles 300 --json > {folder}/price.json""",
+    }
+    run = "\n".join(commands[step] for step in STEPS if step in steps)
     # The tree that virtme-ng mounts queries the host for every file at every import, which takes a minute for the
     # service. An image, whose blocks stay in memory, takes a third of that.
     binds = "\n".join(f"mount --bind /run/python{path} {path}" for path in packed)
@@ -133,26 +152,25 @@ for interrupt in $(awk '/can[01]$/ {{print $1 + 0}}' /proc/interrupts); do
 done
 ip link add vcan0 type vcan
 ip link set vcan0 up
+ip link add vcan1 type vcan
+ip link set vcan1 mtu 72 up
 until [ -s {folder}/{COMPILED} ]; do sleep 0.2; done
 grep -q well {folder}/{COMPILED}
 cp -r {CACHE} /dev/shm/numba
 set +e
-{sys.executable} tools/hil_guest.py {folder}
-export PYTEST_DISABLE_PLUGIN_AUTOLOAD=1  # hypothesis alone takes a quarter of a minute to be loaded
-options='-p pytest_timeout -p no:cacheprovider --noconftest -m vcan -rA --tb=short'
-{sys.executable} -m pytest $options {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log
-echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
-{sys.executable} tools/bench.py frames --cycles 300 --json > {folder}/price.json
+{run}
 """
 
 
 @contextlib.contextmanager
-def machine(folder: Path, kernel: Path, packed: tuple[Path, ...]) -> Iterator[queue.Queue[str | None]]:
+def machine(
+    folder: Path, kernel: Path, packed: tuple[Path, ...], steps: Collection[str] = DEFAULT_STEPS
+) -> Iterator[queue.Queue[str | None]]:
     """Boot the machine; yield the queue of the lines that it prints, which ends with None.
 
     The end of the context kills the machine.
     """
-    (folder / "machine.sh").write_text(script(folder, packed))
+    (folder / "machine.sh").write_text(script(folder, packed, steps))
     devices = (
         f"-drive file={folder}/python.img,format=raw,if=virtio,readonly=on",
         "-cpu Nehalem",  # the minimum for Python's packages: emulating AVX halves the speed

@@ -154,7 +154,7 @@ def main() -> int:
 def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
     """Open the bus of the drives with the configured bit rate and options; for "unix", open the listening end."""
     if interface == "unix":
-        return UnixBus(channel, listen=True)
+        return UnixBus(channel, listen=True, fd=config.can.fd)
     section = msgspec.structs.replace(config.can, interface=interface, channel=channel)
     return open_bus(section, config.drives)
 

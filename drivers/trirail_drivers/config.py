@@ -6,6 +6,8 @@ from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta, Struct
 
+from trirail_drivers.timing import DEFAULT_BITRATE, BusTiming
+
 # The bounds exclude values that no machine of this kind has, so that no later calculation overflows or loses precision.
 Coordinate = Annotated[float, Meta(ge=-100.0, le=100.0)]
 """Position [m]."""
@@ -26,9 +28,6 @@ ProtectionName = Annotated[str, Meta(max_length=64, pattern=r"^([0-9A-F]{4}(:[0-
 NodeId = Annotated[int, Meta(ge=0, le=127)]
 """Node id: CANopen allows 1 to 127, ODrive 0 to 62; the driver refuses other values."""
 
-
-DEFAULT_BITRATE: Final = 1_000_000
-"""Bit rate of a bus [bit/s], unless the configuration sets another one."""
 CountsPerMetre = Annotated[float, Meta(ge=1e-3, le=1e12)]
 
 
@@ -71,6 +70,10 @@ OptionName = Annotated[str, Meta(max_length=64, pattern=r"^[A-Za-z_][A-Za-z0-9_]
 """Keyword argument of a python-can bus."""
 
 
+DATA_BITRATE: Final = 5_000_000
+"""Data bit rate of a CAN FD bus if none is configured [bit/s]."""
+
+
 class Can(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [can]: any python-can interface, or "simulated" (three drives inside the service)."""
 
@@ -82,11 +85,23 @@ class Can(Struct, frozen=True, forbid_unknown_fields=True):
     """Bit rate [bit/s], at most 1 Mbit/s on a physical bus. The bus load is calculated from this value, and interfaces
     that set the bit rate themselves use it.
     """
+    fd: bool = False
+    """Whether the bus is a CAN FD bus: every data frame is sent as a CAN FD frame with bit rate switch, with at most 8
+    data bytes. Only CiA 402 drives on `socketcan`, `unix` or `simulated`.
+    """
+    data_bitrate: Annotated[int, Meta(ge=10_000, le=8_000_000)] | None = None
+    """Bit rate of the data phase of CAN FD frames [bit/s], at least `bitrate`; 5 Mbit/s if omitted. Not without `fd`.
+    """
     options: dict[OptionName, bool | OptionNumber | Name] = {}
     """Options passed to python-can unchanged: `index` of gs_usb, `host` and `port` of socketcand, `tty_baudrate` of
     slcan.
     """
     simulated: Simulated = Simulated()
+
+    @property
+    def timing(self) -> BusTiming:
+        """Bit rates of the bus."""
+        return BusTiming(self.bitrate, (self.data_bitrate or DATA_BITRATE) if self.fd else None)
 
 
 class Homing(Struct, frozen=True, forbid_unknown_fields=True):

@@ -160,7 +160,7 @@ class DriveGroup(Protocol):
 
     @property
     def traffic(self) -> int:
-        """Number of bits in all frames sent and received since the start, with worst-case bit stuffing.
+        """Duration of all frames sent and received since the start, with worst-case bit stuffing [ns].
 
         Frames that the kernel filters out are not counted.
         """

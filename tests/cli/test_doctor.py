@@ -21,13 +21,13 @@ from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import SIM, Config, Tls, everything, impossible, load
 from trirail.diagnosis import Check, bare_loop, diagnose, drive_checks
 from trirail.diagnosis.bare_loop import Cycles
-from trirail.diagnosis.bus_timing import BusTiming
+from trirail.diagnosis.bus_timing import MeasuredTiming
 from trirail.errors import ServiceError
 from trirail.wire.state import Percentiles
-from trirail_drivers.bus.frames import bits_of, frame_bits
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError
 from trirail_drivers.protocols import PROTOCOLS
+from trirail_drivers.timing import DEFAULT_TIMING, BusTiming, frame_bits
 
 CONFIGS = SIM.parent
 SIMULATED = load(SIM)
@@ -264,7 +264,14 @@ def test_what_passes_on_the_bus_is_counted_whoever_sends_it(frames: int, verdict
 @given(st.lists(st.integers(0, 8), max_size=50))
 def test_bits_are_those_of_the_frames_one_a_frame_at_most_too_many(lengths: list[int]) -> None:
     bits = sum(map(frame_bits, lengths))
-    assert bits <= bits_of(len(lengths), sum(lengths)) < bits + len(lengths) + 1
+    assert bits <= BusTiming(1).total_seconds(len(lengths), sum(lengths)) < bits + len(lengths) + 1
+
+
+@given(st.lists(st.integers(0, 16), max_size=50))
+def test_the_time_of_frames_of_can_fd_is_the_sum_of_theirs(lengths: list[int]) -> None:
+    timing = BusTiming(1_000_000, 5_000_000)
+    total = timing.total_seconds(len(lengths), sum(lengths))
+    assert total == pytest.approx(sum(map(timing.frame_ns, lengths)) * 1e-9)
 
 
 def test_the_kernels_counters_are_read_and_subtracted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -389,7 +396,7 @@ def test_the_bus_load_is_judged_as_the_driver_does(protocol: str, rate: int, bit
     config = changed(config, "loop", rate_hz=rate)
     clock = count(1000.0, 1e-6)
     bus = simulated_bus(config.can, config.drives, lambda: next(clock))
-    driver = PROTOCOLS[protocol].driver(bus, bitrate, config.drives, lambda: next(clock))
+    driver = PROTOCOLS[protocol].driver(bus, BusTiming(bitrate), config.drives, lambda: next(clock))
     check = next(drive_checks.load(config))
     refused = ""
     try:
@@ -464,7 +471,7 @@ def test_the_governor_of_every_processor_is_read(tmp_path: Path, monkeypatch: py
     assert check.remedy == "cpupower frequency-set --governor performance"
 
 
-TIMING = BusTiming(
+TIMING = MeasuredTiming(
     source="service",
     timestamps="hardware",
     rate_hz=500,
@@ -496,7 +503,7 @@ def test_the_timing_on_the_bus_is_a_share_of_the_period() -> None:
         (msgspec.structs.replace(TIMING, source="test frames"), "ok", "SYNCs of test frames, which no drive uses"),
     ],
 )
-def test_what_the_timing_on_the_bus_lacks_is_told(timing: BusTiming | str, verdict: str | None, said: str) -> None:
+def test_what_the_timing_on_the_bus_lacks_is_told(timing: MeasuredTiming | str, verdict: str | None, said: str) -> None:
     checks = doctor_cycle.on_bus(timing, REAL)
     assert [check.verdict for check in checks] == ([verdict] if verdict else [])
     assert all(said in check.found for check in checks)
@@ -507,10 +514,11 @@ def test_what_the_timing_on_the_bus_lacks_is_told(timing: BusTiming | str, verdi
     [({}, ""), ({"bitrate": 500_000}, "bit rate"), ({"state": "ERROR-PASSIVE"}, "not error-active")],
 )
 def test_nothing_is_sent_on_an_interface_that_would_disturb_its_bus(changes: dict[str, Any], reason: str) -> None:
-    found = probes.unfit(link(**changes), 1_000_000)
+    found = probes.unfit(link(**changes), DEFAULT_TIMING)
     assert reason in found
     assert bool(found) == bool(reason)
-    assert probes.unfit({"linkinfo": {"info_kind": "vcan"}}, 1_000_000) == ""
+    assert probes.unfit({"linkinfo": {"info_kind": "vcan"}}, DEFAULT_TIMING) == ""
+    assert "on a CAN FD bus" in probes.unfit(link(), BusTiming(1_000_000, 5_000_000))
 
 
 def test_the_bus_is_measured_only_if_it_is_up_and_on_request(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -303,7 +303,7 @@ def test_only_a_bus_without_a_wire_is_faster_than_classical_can(interface: str, 
 def test_what_stands_in_can_is_no_option(name: str) -> None:
     text = TEXT.replace('interface = "simulated"', 'interface = "gs_usb"')
     with pytest.raises(
-        ConfigError, match=rf"can.options.{name}: not allowed here; set interface, channel and bitrate in \[can\]"
+        ConfigError, match=rf"can.options.{name}: not allowed here; set interface, channel, bitrates and fd in \[can\]"
     ):
         parse(f'{text}\n[can.options]\n{name} = "x"\n')
 

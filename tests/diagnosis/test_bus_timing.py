@@ -16,13 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import LoopTable
 from trirail.diagnosis import bus_timing
-from trirail.diagnosis.bus_timing import TEST_FRAMES, BusTiming, compute_timing
+from trirail.diagnosis.bus_timing import TEST_FRAMES, MeasuredTiming, compute_timing
 from trirail_drivers.bus import loopback
 from trirail_drivers.bus.can_frame import CAN_FRAME, ERROR, REMOTE
 from trirail_drivers.bus.loopback import StampedFrame
 from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.protocols import CIA402
+from trirail_drivers.timing import DEFAULT_TIMING, BusTiming
 
 SYNC, SETPOINTS = layout.SYNC, CIA402.setpoints
 LOOP = LoopTable(rate_hz=100, realtime="off")
@@ -168,7 +169,7 @@ HEARTBEATS = [frame(layout.HEARTBEAT + node, 1000.0 * node, 1, local=False) for 
     [
         ([], {}, "test frames were sent"),
         (HEARTBEATS, {}, "test frames were sent"),
-        (HEARTBEATS, {"bitrate": 10_000}, "other nodes use 8.2% of the bus"),
+        (HEARTBEATS, {"bus": BusTiming(10_000)}, "other nodes use 8.2% of the bus"),
         ([frame(SYNC, 0.0, 0, local=False)], {}, "another node sends SYNC"),
         ([frame(SYNC, 0.0, 0)], {}, "only one SYNC"),
         ([], {"unfit": "not error-active"}, "not error-active"),
@@ -181,7 +182,7 @@ def test_test_frames_are_sent_only_on_an_idle_bus(
 ) -> None:
     monkeypatch.setattr(bus_timing, "Loopback", type("Heard", (FakeLoopback,), {"heard": heard}))
     monkeypatch.setattr(bus_timing, "_send_test_frames", sent)
-    arguments: dict[str, Any] = {"channel": "can0", "bitrate": 1_000_000, "sync": SYNC} | more
+    arguments: dict[str, Any] = {"channel": "can0", "bus": DEFAULT_TIMING, "sync": SYNC} | more
     found = bus_timing.measure(loop=LOOP, setpoints=SETPOINTS, **arguments)
     assert isinstance(found, str)
     assert found.startswith(said)
@@ -191,8 +192,8 @@ def test_a_service_is_listened_to(monkeypatch: pytest.MonkeyPatch) -> None:
     heard = cycles([0.0] * 10, [300.0] * 10)
     monkeypatch.setattr(bus_timing, "Loopback", type("Heard", (FakeLoopback,), {"heard": heard}))
     monkeypatch.setattr(bus_timing, "_send_test_frames", sent)
-    found = bus_timing.measure("can0", 1_000_000, LOOP, SYNC, SETPOINTS, "not error-active")
-    assert isinstance(found, BusTiming)
+    found = bus_timing.measure("can0", DEFAULT_TIMING, LOOP, SYNC, SETPOINTS, "not error-active")
+    assert isinstance(found, MeasuredTiming)
     assert found.source == "service"
     assert found.setpoints_us is not None
     assert found.setpoints_us.p50 == 300.0
@@ -220,11 +221,11 @@ def test_the_kernel_stamps_what_a_service_sends(interface: str, monkeypatch: pyt
         service.start()
         try:
             began = time.time_ns()
-            found = bus_timing.measure(interface, 1_000_000, LOOP, SYNC, SETPOINTS)
+            found = bus_timing.measure(interface, DEFAULT_TIMING, LOOP, SYNC, SETPOINTS)
         finally:
             ended.set()
             service.join()
-    assert isinstance(found, BusTiming)
+    assert isinstance(found, MeasuredTiming)
     assert (found.source, found.timestamps) == ("service", "software")
     assert found.setpoints_us is not None
     assert 0.0 < found.setpoints_us.p50 < (time.time_ns() - began) * 1e-3
@@ -235,9 +236,9 @@ def test_the_kernel_stamps_what_a_service_sends(interface: str, monkeypatch: pyt
 def test_test_frames_are_measured_and_nothing_else_is_sent(interface: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bus_timing, "SENDING_S", 1.0)
     with loopback.Loopback(interface) as other:
-        found = bus_timing.measure(interface, 1_000_000, LOOP, SYNC, SETPOINTS)
+        found = bus_timing.measure(interface, DEFAULT_TIMING, LOOP, SYNC, SETPOINTS)
         frames = list(other.arrived())
-    assert isinstance(found, BusTiming)
+    assert isinstance(found, MeasuredTiming)
     assert (found.source, found.rate_hz) == ("test frames", 100)
     assert found.setpoints_us is not None
     assert found.syncs == 100

@@ -39,7 +39,7 @@ class Rig:
         self.now = 100.0
         self.bus = simulated_bus(robot.can, robot.drives, lambda: self.now)
         protocol = PROTOCOLS[robot.drives.protocol]
-        self.drives = protocol.driver(self.bus, robot.can.bitrate, robot.drives, lambda: self.now)
+        self.drives = protocol.driver(self.bus, robot.can.timing, robot.drives, lambda: self.now)
         self.drives.configure(robot.period)
         self.period = robot.period
         self.target = self.drives.read().position

@@ -5,11 +5,12 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import PowerState
+from trirail_drivers.timing import BusTiming, frame_bits
 
 P = PowerState
+MEGABIT = BusTiming(1_000_000)
 
 
 @given(n=st.integers(0, 8), pattern=st.integers(0, 2**98 - 1))
@@ -38,14 +39,14 @@ def test_worst_case_is_reached(n: int) -> None:
 
 
 def test_a_kilohertz_fills_three_quarters_of_a_megabit() -> None:
-    assert canopen_frames.TRAFFIC.cycle_bits == 745
-    assert canopen_frames.TRAFFIC.bus_load(1000, 1_000_000, 0.1) == pytest.approx(0.75, abs=0.001)
+    assert canopen_frames.TRAFFIC.cycle_seconds(MEGABIT) == pytest.approx(745e-6)
+    assert canopen_frames.TRAFFIC.bus_load(1000, MEGABIT, 0.1) == pytest.approx(0.75, abs=0.001)
 
 
 @given(bitrate=st.sampled_from([125_000, 250_000, 500_000, 1_000_000]), heartbeat=st.floats(0.05, 1.0))
 def test_the_highest_rate_fills_the_bus(bitrate: int, heartbeat: float) -> None:
-    rate = canopen_frames.TRAFFIC.highest_rate(bitrate, heartbeat)
-    assert canopen_frames.TRAFFIC.bus_load(rate, bitrate, heartbeat) == pytest.approx(1.0)
+    rate = canopen_frames.TRAFFIC.highest_rate(BusTiming(bitrate), heartbeat)
+    assert canopen_frames.TRAFFIC.bus_load(rate, BusTiming(bitrate), heartbeat) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("state", list(PowerState))

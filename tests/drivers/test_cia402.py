@@ -22,6 +22,7 @@ from trirail_drivers.errors import ConfigurationRefused, DriveError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import SimulatedDrive
 from trirail_drivers.simulated.dictionary import ObjectEntry
+from trirail_drivers.timing import BusTiming
 
 P = PowerState
 PERIOD = STEP
@@ -248,7 +249,9 @@ class TestConfigure:
     )
     def test_what_no_drives_can_be_is_refused(self, keys: dict[str, Any], said: str) -> None:
         with pytest.raises(DriveError, match=said):
-            Cia402(Bus([], Clock(), {}), 1_000_000, msgspec.structs.replace(CONFIG, **keys)).configure(PERIOD)
+            Cia402(Bus([], Clock(), {}), BusTiming(1_000_000), msgspec.structs.replace(CONFIG, **keys)).configure(
+                PERIOD
+            )
 
     @pytest.mark.parametrize(
         ("rate", "said"),

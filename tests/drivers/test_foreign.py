@@ -23,6 +23,7 @@ from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.protocols import PROTOCOLS
+from trirail_drivers.timing import BusTiming
 
 PERIOD = 0.002
 COUNTS = 819_200.0
@@ -78,7 +79,7 @@ class Rig(Cycles[Cia402]):
         self.wires, self.clock = three(
             name, dict.fromkeys((1, 2, 3), truth or make.truth), habits=habits, rebased=rebased
         )
-        self.drives = Cia402(self.wires, 1_000_000, self.config, self.clock, io=io)
+        self.drives = Cia402(self.wires, BusTiming(1_000_000), self.config, self.clock, io=io)
         self.warnings: list[str] = []
 
     @property

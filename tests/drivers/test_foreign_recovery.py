@@ -18,6 +18,7 @@ from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import Feedback, PowerState
+from trirail_drivers.timing import BusTiming
 from waiting import WITHIN
 
 ENDS = 4000
@@ -62,7 +63,7 @@ class KilledDrives:
         self.bus = UnixBus(str(channel), listen=True)
         # A busy machine may keep either process waiting.
         config = Drives("cia402", *alike(counts_per_metre=COUNTS), heartbeat=1.0, missed_positions=100)
-        self.drives = Cia402(self.bus, 1_000_000, config)
+        self.drives = Cia402(self.bus, BusTiming(1_000_000), config)
         self.process = self.start()
         self.powered = False
         """Whether a drive may have power."""

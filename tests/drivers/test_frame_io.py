@@ -20,6 +20,7 @@ from trirail_drivers.bus.capture import Capture
 from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.wire import Wire
+from trirail_drivers.timing import BusTiming
 
 BUSES = [
     pytest.param(kind, way, id=f"{kind}, {way}", marks=marks)
@@ -151,7 +152,7 @@ class Listener:
 @carriers.on_vcan
 def test_the_kernel_keeps_out_what_nobody_listens_to_but_no_report_of_the_controller() -> None:
     with carriers.bus("vcan") as (bus, far):
-        listener, wire = Listener(), Wire(bus, lambda: None)
+        listener, wire = Listener(), Wire(bus, BusTiming(1_000_000), lambda: None)
         wire.listen(0x281, listener, listener.take)
         wire.listen(0x701, listener, listener.take)
         for identifier in (*range(0x800), 0x281 | EXTENDED):
@@ -160,7 +161,7 @@ def test_the_kernel_keeps_out_what_nobody_listens_to_but_no_report_of_the_contro
         before = wire.traffic
         wire.receive(0.0)
         assert len(listener.heard) == 2
-        assert wire.traffic - before == 2 * 95
+        assert wire.traffic - before == 2 * 95_000
         assert wire.fault is not None
         assert "bus-off" in wire.fault.message
 
@@ -215,7 +216,7 @@ def test_slcans_acknowledgements_do_not_hide_the_frames_behind_them() -> None:
     listener = Listener()
     try:
         with can.Bus(os.ttyname(terminal), "slcan", sleep_after_open=0.0, ignore_config=True) as bus:
-            wire = Wire(bus, lambda: None)
+            wire = Wire(bus, BusTiming(1_000_000), lambda: None)
             wire.listen(0x281, listener, listener.take)
             for cycle in range(1, 51):
                 for node in (1, 2, 3):

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import pytest
 from drivers.test_cia402 import PERIOD, Rig
 from rigs import OFF, frame
-from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.interface import PowerState
+from trirail_drivers.timing import frame_bits
 
 ROOM = 3 * frame_bits(8) / 1e6
 """Time for a frame to each drive, at 1 Mbit/s [s]."""

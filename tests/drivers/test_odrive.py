@@ -26,6 +26,7 @@ from trirail_drivers.odrive.flat_endpoints import Version
 from trirail_drivers.odrive.setpoints import SETTLE_TIME_S
 from trirail_drivers.simulated import SimulatedOdrive
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
+from trirail_drivers.timing import BusTiming
 
 P = PowerState
 PERIOD = STEP
@@ -137,7 +138,7 @@ class TestConfigure:
             else f"drives.C.node = {node}: the node id of an ODrive is 0 to 62"
         )
         with pytest.raises(DriveError, match=said):
-            Odrive(Bus([], Clock(), {}), 1_000_000, drives)
+            Odrive(Bus([], Clock(), {}), BusTiming(1_000_000), drives)
 
 
 class TestPower:

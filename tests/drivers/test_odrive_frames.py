@@ -12,8 +12,8 @@ import pytest
 from cantools.database.can import Database
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.odrive import cansimple
+from trirail_drivers.timing import BusTiming, frame_bits
 
 LOADED = cantools.database.load_file(Path(__file__).parents[1] / "data" / "odrive-cansimple.dbc")
 assert isinstance(LOADED, Database)
@@ -125,11 +125,11 @@ def test_errors_in_words() -> None:
 def test_bus_load_counts_what_passes_in_a_second() -> None:
     setpoint, request, answer, heartbeat = frame_bits(8), frame_bits(0), frame_bits(8), frame_bits(8)
     bits = 1000 * 3 * (setpoint + request + answer) + 100 * (request + answer) + 3 * 10 * heartbeat
-    assert cansimple.TRAFFIC.bus_load(1000.0, 1_000_000, 0.1) == pytest.approx(bits / 1e6)
+    assert cansimple.TRAFFIC.bus_load(1000.0, BusTiming(1_000_000), 0.1) == pytest.approx(bits / 1e6)
     assert 0.99 < bits / 1e6 < 1.0
 
 
 @given(bitrate=st.integers(125_000, 1_000_000), heartbeat=st.floats(0.01, 1.0))
 def test_highest_rate_fills_the_bus(bitrate: int, heartbeat: float) -> None:
-    rate = cansimple.TRAFFIC.highest_rate(bitrate, heartbeat)
-    assert cansimple.TRAFFIC.bus_load(rate, bitrate, heartbeat) == pytest.approx(1.0)
+    rate = cansimple.TRAFFIC.highest_rate(BusTiming(bitrate), heartbeat)
+    assert cansimple.TRAFFIC.bus_load(rate, BusTiming(bitrate), heartbeat) == pytest.approx(1.0)

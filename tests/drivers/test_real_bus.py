@@ -19,7 +19,8 @@ from carriers import NAME, ip, on_vcan
 from drivers.real_time import cycle, cycle_until
 from rigs import alike
 from trirail_drivers.bus import wire as wires
-from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.frame_io import SocketFrames, frame_io
+from trirail_drivers.bus.frames import Frame, is_fd
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drives, Simulated
@@ -161,3 +162,29 @@ def test_an_interface_that_goes_down_is_a_fault_of_the_bus(driver: Cia402) -> No
     assert fault is not None
     assert fault.cause == "bus"
     assert "CAN bus" in fault.message
+
+
+@on_vcan
+def test_frames_of_can_fd_pass_between_two_sockets_of_the_kernel() -> None:
+    section = Can("socketcan", channel=NAME, fd=True)
+    with carriers.vcan(), opening.open_bus(section, DRIVES) as one, opening.open_bus(section, DRIVES) as other:
+        assert is_fd(one)
+        frames = frame_io(other)
+        assert isinstance(frames, SocketFrames)
+        frames.set_identifiers({0x123})
+        one.send(Frame(0x123, b"\1\2").message())
+        assert frames.receive(60.0) == (0x123, bytearray(b"\1\2"))
+        frames.send(Frame(0x124, b"\3"))
+        arrived = one.recv(60.0)
+        assert arrived is not None
+        assert (arrived.is_fd, arrived.bitrate_switch, bytes(arrived.data)) == (True, True, b"\3")
+
+
+@on_vcan
+def test_an_interface_of_the_kernel_without_can_fd_is_refused() -> None:
+    section = Can("socketcan", channel=NAME, fd=True)
+    with carriers.vcan():
+        ip("link", "set", NAME, "down")
+        ip("link", "set", NAME, "mtu", "16", "up")
+        with pytest.raises(BusError, match=r"for classical CAN only \(MTU 16\)"):
+            opening.open_bus(section, DRIVES)

@@ -398,7 +398,7 @@ class AbsentRig(RecoveryRig):
 
         self.bus.send = send  # type: ignore[assignment,method-assign]
         self.cut(*absent)
-        driver = PROTOCOLS[config.drives.protocol].driver(self.bus, config.can.bitrate, config.drives, lambda: self.now)
+        driver = PROTOCOLS[config.drives.protocol].driver(self.bus, config.can.timing, config.drives, lambda: self.now)
         driver.configure(config.period, awaits=True)
         self.bus.send = self._note  # type: ignore[assignment,method-assign]
         super(Rig, self).__init__(config, driver)

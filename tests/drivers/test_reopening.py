@@ -124,7 +124,7 @@ class BusRig(RecoveryRig):
         reopening = Reopening("can0", self.open_bus, begin)
         bus: can.BusABC = AbsentBus("can0", absent) if absent else self.open_bus()
         driver = PROTOCOLS[config.drives.protocol].driver(
-            bus, config.can.bitrate, config.drives, lambda: self.now, reopening
+            bus, config.can.timing, config.drives, lambda: self.now, reopening
         )
         driver.configure(config.period, awaits=True)
         self.runs = True

@@ -49,7 +49,7 @@ class Run:
         starts = zip(config.drives.each, rigs.START, strict=True)
         devices = [protocol.simulated_drive(config.can.simulated, config.drives, axis, start) for axis, start in starts]
         self.bus = rigs.Bus(devices, self.clock, protocol.fault_frames)
-        self.drives: DriveGroup = protocol.driver(self.bus, config.can.bitrate, config.drives, self.clock)
+        self.drives: DriveGroup = protocol.driver(self.bus, config.can.timing, config.drives, self.clock)
         self.drives.configure(config.period)
 
     def cycle(self, ahead: float = 0.0, velocity: float = 0.0, start: tuple[float, ...] | None = None) -> Feedback:
@@ -119,7 +119,7 @@ def test_what_an_example_says_of_its_drives_it_needs_to_say(name: str, tmp_path:
 def test_an_example_leaves_room_on_its_bus_and_names_what_its_drives_can_answer(path: Path) -> None:
     config = load(path)
     protocol = PROTOCOLS[config.drives.protocol]
-    assert protocol.traffic.bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat) <= HIGH_LOAD
+    assert protocol.traffic.bus_load(config.loop.rate_hz, config.can.timing, config.drives.heartbeat) <= HIGH_LOAD
     assert ("trirail drives FILE" in path.read_text(encoding="utf-8")) == (protocol.inspect is not None)
 
 

@@ -19,6 +19,7 @@ from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
+from trirail_drivers.timing import BusTiming
 
 GIVEN = re.compile(r"(?:within|after|for) ([\d.e-]+) s\b")
 """How long was waited, in a refusal."""
@@ -47,7 +48,7 @@ class SlowRig(Rig):
             stop_timeout=stop_timeout,
         )
         self.wires, self.clock = three_slow(name, make.truth, slow, habits)
-        self.drives = Cia402(self.wires, 1_000_000, self.config, self.clock)
+        self.drives = Cia402(self.wires, BusTiming(1_000_000), self.config, self.clock)
         self.warnings = []
 
 

@@ -22,6 +22,7 @@ from trirail_drivers.config import NO_IO, DigitalIo, Drive, Drives
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import SimulatedDrive
+from trirail_drivers.timing import DEFAULT_TIMING, BusTiming
 
 from drivers import test_cia402
 
@@ -65,7 +66,7 @@ class Rig(test_cia402.Rig):
         io = keys.pop("io", NO_IO)
         a, b, c = alike()
         super().__init__(Drives("cia402", a, b, c, sdo_timeout=0.01, **keys), io)
-        self.drives._bitrate = bitrate
+        self.drives._timing = BusTiming(bitrate)
 
     def device(self, drive: Drive, counts: float) -> SimulatedDrive:
         path = self._files[self._kinds[drive.node - 1]]
@@ -148,7 +149,7 @@ def test_the_choice_does_not_depend_on_the_drives_that_answer(files: dict[str, P
     """At 1190 Hz, one drive with the offset would keep the budget: a drive that comes later might have it as well."""
     rig = Rig(files, (MAPPABLE, LACKING, LACKING))
     assert share((8, 4, 4), 1190, 1_000_000, 0.1) < HIGH_LOAD < share((8, 8, 8), 1190, 1_000_000, 0.1)
-    plan = plan_traffic(rig.config, NO_IO, 1190, 1_000_000)
+    plan = plan_traffic(rig.config, NO_IO, 1190, DEFAULT_TIMING)
     assert (plan.velocity_offset, plan.setpoint_bytes) == (False, 4)
     assert plan.full_load == pytest.approx(share((8, 8, 8), 1190, 1_000_000, 0.1))
     rig.drives.close()
@@ -311,4 +312,4 @@ def test_an_inspection_shows_the_mapping_of_the_set_up(closing: Closing, files: 
 
 def test_the_period_of_the_rigs_keeps_the_offset() -> None:
     config = msgspec.structs.replace(test_cia402.CONFIG)
-    assert plan_traffic(config, NO_IO, 1.0 / STEP, 1_000_000).velocity_offset
+    assert plan_traffic(config, NO_IO, 1.0 / STEP, DEFAULT_TIMING).velocity_offset

@@ -17,10 +17,11 @@ import pytest
 from carriers import FarEnd
 from trirail_drivers.bus import wire as wires
 from trirail_drivers.bus.can_frame import ERROR, EXTENDED, REMOTE
-from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.interface import DriveFault
+from trirail_drivers.timing import BusTiming, frame_bits
 
 
 class Listener:
@@ -41,7 +42,7 @@ class Rig:
 
     def __init__(self, bus: UnixBus, far: FarEnd) -> None:
         self.bus, self.far, self.stops = bus, far, 0
-        self.wire = Wire(bus, self.stop)
+        self.wire = Wire(bus, BusTiming(1_000_000), self.stop)
         self.listener = Listener()
         self.wire.listen(0x281, self.listener, self.listener.take)
 
@@ -130,10 +131,10 @@ def test_frames_are_taken_in_up_to_a_number_and_then_the_cycle_goes_on(
 @pytest.mark.parametrize("length", range(9))
 def test_traffic_counts_each_frame_with_its_worst_stuffing(rig: Rig, length: int) -> None:
     rig.wire.send(Frame(0x123, bytes(length)))
-    assert rig.wire.traffic == frame_bits(length)
+    assert rig.wire.traffic == 1000 * frame_bits(length)
     rig.far.send(0x456, bytes(length))
     rig.wire.receive(0.0)
-    assert rig.wire.traffic == 2 * frame_bits(length)
+    assert rig.wire.traffic == 2000 * frame_bits(length)
 
 
 def test_only_data_frames_of_the_identifier_are_heard(rig: Rig) -> None:

@@ -35,7 +35,7 @@ from trirail.wire.packets import CommandRequest, EventReport, GoalRequest, Kind,
 from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
 from trirail.wire.vocabulary import MODES, Command, Mode
-from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED
+from trirail_drivers.bus.can_frame import BIT_RATE_SWITCH, CAN_FRAME, CANFD_FRAME, CAPTURED, FD_FORMAT
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.connection.opening import simulated_bus
@@ -86,7 +86,7 @@ class Session:
         self.ends = Lockstep(carrier, folder, self)
         self._stack.callback(self.ends.close)
         self.driver = driver = PROTOCOLS[config.drives.protocol].driver(
-            self.ends.bus, config.can.bitrate, config.drives, self.clock_of_driver, None, config.drive_io
+            self.ends.bus, config.can.timing, config.drives, self.clock_of_driver, None, config.drive_io
         )
         self.setting_up = True
         driver.configure(config.period, config.limits.slider.velocities[0])
@@ -343,6 +343,23 @@ def test_quiet_cycles_are_those_of_python_to_the_last_bit(
     carrier: str, protocol: str, seed: int, tmp_path: Path
 ) -> None:
     both_ways(CONFIGS[protocol], tmp_path, lambda: script(seed, protocol), CYCLES, carrier)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_session_on_can_fd_sends_what_it_sends_on_classical_can(seed: int, tmp_path: Path) -> None:
+    """In the same order and to the last bit; each frame is one of CAN FD. What is injected is of classical CAN."""
+    places = [tmp_path / name for name in ("classical", "fd")]
+    for place in places:
+        place.mkdir()
+    fast = structs.replace(CONFIG, can=structs.replace(CONFIG.can, fd=True))
+    classical = both_ways(CONFIG, places[0], lambda: script(seed), CYCLES)
+    fd = both_ways(fast, places[1], lambda: script(seed), CYCLES, "fd")
+    sent = [CANFD_FRAME.unpack(packet) for packet in fd.sent]
+    assert {flags for _, _, flags, _ in sent} == {FD_FORMAT | BIT_RATE_SWITCH}
+    assert [(identifier, data[:length]) for identifier, length, _, data in sent] == [
+        (identifier, data[:length]) for identifier, length, data in map(CAN_FRAME.unpack, classical.sent)
+    ]
+    assert 0 < fd.driver.traffic < classical.driver.traffic
 
 
 @pytest.mark.generated(0, 1, 2, 3)

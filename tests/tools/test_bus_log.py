@@ -10,6 +10,7 @@ import pytest
 from bus_log import Frame
 from trirail.config import SIM, load
 from trirail_drivers.cia402 import canopen_frames as layout
+from trirail_drivers.timing import BusTiming
 
 CONFIG = load(SIM.parent / "socketcan.toml")
 PERIOD = CONFIG.period
@@ -162,7 +163,7 @@ def with_frame(identifier: int, data: bytes, t: float) -> list[Frame]:
 
 
 def gaps(log: list[Frame]) -> list[str]:
-    return list(bus_log.gap_problems(log, PERIOD, CONFIG.can.bitrate, CONFIG.drives.master_node))
+    return list(bus_log.gap_problems(log, PERIOD, CONFIG.can.timing, CONFIG.drives.master_node))
 
 
 BEFORE = 1.0 + 20 * PERIOD
@@ -213,4 +214,4 @@ def test_a_cycle_with_late_setpoints_is_no_gap_that_was_missed() -> None:
 def test_the_frame_time_is_that_of_the_bit_rate() -> None:
     log = with_frame(layout.SDO_REQUEST + 1, layout.STATUSWORD_UPLOAD, BEFORE - 2e-4)
     assert gaps(log) == []
-    assert list(bus_log.gap_problems(log, PERIOD, 500_000, CONFIG.drives.master_node))
+    assert list(bus_log.gap_problems(log, PERIOD, BusTiming(500_000), CONFIG.drives.master_node))

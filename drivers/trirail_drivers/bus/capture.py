@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import can
 
 from trirail_drivers.bus.can_frame import CAPTURED
-from trirail_drivers.bus.frames import packed
+from trirail_drivers.bus.frames import fd_message, is_fd, packed
 
 CHUNK_FRAMES = 1024
 """Maximum number of frames in a chunk."""
@@ -23,7 +23,7 @@ class Capture:
         self._frames = bytearray()
 
     def note(self, frame: bytes | bytearray, t: float) -> None:
-        """Add a `struct can_frame` and its time, in seconds since 1970, unless the buffer is full."""
+        """Add a `struct can_frame` or `struct canfd_frame` and its time, in seconds since 1970, if there is space."""
         if len(self._frames) < MAX_FRAMES * CAPTURED.size:
             self._frames += CAPTURED.pack(t, frame)
 
@@ -43,12 +43,13 @@ class CapturedBus(can.BusABC):
         self.capture = capture
         """Buffer of the captured frames."""
         self.channel_info = f"{bus.channel_info}, captured"
+        self._can_protocol = bus.protocol
         super().__init__(channel=self.channel_info)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send and capture a frame."""
         self.inner.send(msg, timeout)
-        self.capture.note(packed(msg), time.time())
+        self.capture.note(packed(fd_message(msg) if is_fd(self.inner) else msg), time.time())
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Receive and capture a frame."""

@@ -12,13 +12,13 @@ from collections import deque
 from collections.abc import Collection
 from typing import Protocol
 
-from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.can_frame import CAN_FRAME, CANFD_FRAME
 from trirail_drivers.bus.frame_io import FrameIO, Received, SocketFrames
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 
 _CALL = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-"""Type of a C function whose arguments are the address and the number of consecutive `struct can_frame`."""
+"""Type of a C function whose arguments are the address and the number of consecutive rows of a PackedFrames."""
 
 
 class LentFrames(FrameIO, Protocol):
@@ -87,7 +87,7 @@ class FrameCalls:
                 identifier, data = received
                 ctypes.memmove(address, CAN_FRAME.pack(identifier, len(data), data), CAN_FRAME.size)
                 frames.append(received)
-                address += CAN_FRAME.size
+                address += CANFD_FRAME.size
         except BaseException as error:  # noqa: BLE001 - no exception passes compiled code; the next receive raises it
             self._failure = error
             return ~len(frames)  # negative even if 0 frames were received
@@ -96,7 +96,8 @@ class FrameCalls:
     def _send_all(self, address: int, number: int) -> int:
         try:
             for sent in range(number):
-                self._frames.send(Frame.from_packed(ctypes.string_at(address + sent * CAN_FRAME.size, CAN_FRAME.size)))
+                packed = ctypes.string_at(address + sent * CANFD_FRAME.size, CAN_FRAME.size)
+                self._frames.send(Frame.from_packed(packed))
         except BaseException as error:  # noqa: BLE001 - the next send raises it
             self._refusal = error
             return sent

@@ -2,8 +2,8 @@
 
 The frames pass through the socket of the bus if the bus has one, otherwise through python-can.
 
-python-can opens and configures every bus. If the bus is a socket of `struct can_frame` (SocketCAN, or the bus between
-processes), packed frames take a fifth of the time of python-can's messages.
+python-can opens and configures every bus. If the bus is a socket of `struct can_frame` or `struct canfd_frame`
+(SocketCAN, or the bus between processes), packed frames take a fifth of the time of python-can's messages.
 """
 
 from __future__ import annotations
@@ -23,9 +23,18 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.typechecking import CanFilter
 
-from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, HEADER, REMOTE, STANDARD_BITS
+from trirail_drivers.bus.can_frame import (
+    CANFD_FRAME,
+    DATA_AT,
+    FD_FLAGS_AT,
+    FD_FORMAT,
+    FRAME_SIZES,
+    HEADER,
+    REMOTE,
+    STANDARD_BITS,
+)
 from trirail_drivers.bus.capture import Capture, CapturedBus
-from trirail_drivers.bus.frames import Frame, can_id
+from trirail_drivers.bus.frames import Frame, can_id, fd_packed, is_fd
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.bus.unixbus import UnixBus
 
@@ -62,15 +71,16 @@ def frame_io(bus: can.BusABC) -> FrameIO:
     """Return the fastest access to a bus."""
     inner, capture = (bus.inner, bus.capture) if isinstance(bus, CapturedBus) else (bus, None)
     if isinstance(inner, UnixBus) and inner.carrier is not None:
-        return SocketFrames(inner.carrier, capture)
-    if isinstance(inner, SocketcanBus) and inner.channel and inner.protocol is can.CanProtocol.CAN_20:
+        return SocketFrames(inner.carrier, capture, fd=is_fd(inner))
+    formats = can.CanProtocol.CAN_20, can.CanProtocol.CAN_FD
+    if isinstance(inner, SocketcanBus) and inner.channel and inner.protocol in formats:
         # A capture needs every frame; without one, the kernel filters out frames that have no listener.
-        return SocketFrames(inner.socket, capture, interface=inner, filtered=not capture)
+        return SocketFrames(inner.socket, capture, interface=inner, filtered=not capture, fd=is_fd(inner))
     return PythonCanFrames(bus, receives_own_frames=isinstance(inner, UdpMulticastBus))
 
 
 class SocketFrames:
-    """Frames on a socket that carries one `struct can_frame` per packet."""
+    """Frames on a socket that carries one `struct can_frame` or `struct canfd_frame` per packet."""
 
     def __init__(
         self,
@@ -79,16 +89,18 @@ class SocketFrames:
         interface: SocketcanBus | None = None,
         *,
         filtered: bool = False,
+        fd: bool = False,
     ) -> None:
         """`interface` is the bus of a SocketCAN socket.
 
-        If `filtered`, the kernel drops frames that have no listener.
+        If `filtered`, the kernel drops frames that have no listener. If `fd`, data frames are sent as CAN FD frames.
         """
         self._socket = carrier
         self._capture = capture
         self._interface = interface
         self._filtered = filtered
-        self._packet = bytearray(CAN_FRAME.size)
+        self._fd = fd
+        self._packet = bytearray(CANFD_FRAME.size)
         self._returned: deque[Received] = deque()
         self._error = 0
         self._poll = select.poll()
@@ -98,9 +110,10 @@ class SocketFrames:
 
     def send(self, frame: Frame) -> None:
         """Send a frame without waiting, or raise."""
-        self._socket.send(frame.packed, socket.MSG_DONTWAIT)
+        packed = fd_packed(frame.packed) if self._fd else frame.packed
+        self._socket.send(packed, socket.MSG_DONTWAIT)
         if self._capture is not None:
-            self._capture.note(frame.packed, time.time())
+            self._capture.note(packed, time.time())
 
     def receive(self, timeout: float = 0.0) -> Received | None:
         """Return the next frame that has arrived or arrives within `timeout` [s]; otherwise None."""
@@ -121,7 +134,7 @@ class SocketFrames:
             return None
         except ConnectionError:  # the other end died before it had read all frames
             size = 0
-        if size != CAN_FRAME.size:  # 0 means end of file on a SOCK_SEQPACKET socket
+        if size not in FRAME_SIZES:  # 0 means end of file on a SOCK_SEQPACKET socket
             raise can.CanOperationError("the listening end has closed the connection")
         identifier, length = HEADER.unpack_from(packet)
         return identifier, packet[DATA_AT : DATA_AT + (0 if identifier & REMOTE else length)]
@@ -160,7 +173,10 @@ class SocketFrames:
             if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
                 seconds, nanoseconds = TIMESPEC.unpack(data)
                 arrived = seconds + nanoseconds * 1e-9
-        if size == CAN_FRAME.size:
+        if size in FRAME_SIZES:
+            # Not every kernel sets the flag, and in a classical frame the byte is padding.
+            flags = self._packet[FD_FLAGS_AT] | FD_FORMAT if size == CANFD_FRAME.size else 0
+            self._packet[FD_FLAGS_AT] = flags
             capture.note(self._packet, arrived)
         return size
 

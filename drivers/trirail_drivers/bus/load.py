@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 from trirail_drivers.errors import BusError
+from trirail_drivers.timing import BusTiming
 
 HIGH_LOAD: Final = 0.8
 """Worst-case fraction of the bus capacity above which a warning is emitted, since acyclic frames then have to wait."""
@@ -14,40 +14,53 @@ HIGH_LOAD: Final = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """Bus traffic of three drives and the service. Numbers of bits include worst-case stuffing."""
+    """Bus traffic of three drives and the service, as data lengths of frames [bytes]."""
 
-    cycle_bits: int
-    """Number of bits of the frames in one cycle."""
-    background: Callable[[float], float]
-    """Function that returns the bits per second independent of the cycle, given the heartbeat period [s]."""
+    cycle: tuple[int, ...]
+    """Lengths of the frames in one cycle."""
+    periodic: tuple[tuple[int, float], ...]
+    """Lengths of the frames that are independent of the cycle, each with its period [s]."""
+    heartbeats: tuple[int, ...]
+    """Lengths of the frames that are sent once per heartbeat period."""
     most_sent: int
     """Maximum number of frames that the service sends in one cycle."""
-    output_bits: int = 0
-    """Number of bits of a frame with digital outputs."""
+    output: int = 0
+    """Length of a frame with digital outputs."""
 
     def with_outputs(self, drives: int) -> Traffic:
         """Return the traffic with the digital outputs of this number of drives, which may change in every cycle."""
-        bits = drives * self.output_bits
-        return replace(self, cycle_bits=self.cycle_bits + bits, most_sent=self.most_sent + drives)
+        return replace(self, cycle=self.cycle + drives * (self.output,), most_sent=self.most_sent + drives)
 
-    def bus_load(self, rate_hz: float, bitrate: int, heartbeat: float) -> float:
+    def cycle_seconds(self, timing: BusTiming) -> float:
+        """Return the worst-case duration of the frames in one cycle [s]."""
+        return sum(map(timing.frame_ns, self.cycle)) * 1e-9
+
+    def background(self, timing: BusTiming, heartbeat: float) -> float:
+        """Return the worst-case fraction of the bus capacity that the other frames use.
+
+        `heartbeat` is the heartbeat period [s].
+        """
+        periodic = sum(timing.frame_ns(length) / period for length, period in self.periodic)
+        return (periodic + sum(map(timing.frame_ns, self.heartbeats)) / heartbeat) * 1e-9
+
+    def bus_load(self, rate_hz: float, timing: BusTiming, heartbeat: float) -> float:
         """Return the worst-case fraction of the bus capacity that all frames use; 1.0 is a full bus."""
-        return (rate_hz * self.cycle_bits + self.background(heartbeat)) / bitrate
+        return rate_hz * self.cycle_seconds(timing) + self.background(timing, heartbeat)
 
-    def highest_rate(self, bitrate: int, heartbeat: float) -> float:
+    def highest_rate(self, timing: BusTiming, heartbeat: float) -> float:
         """Return the cycle rate [Hz] at which the bus is full; 0 if the other frames alone fill it."""
-        return max(0.0, (bitrate - self.background(heartbeat)) / self.cycle_bits)
+        return max(0.0, (1.0 - self.background(timing, heartbeat)) / self.cycle_seconds(timing))
 
-    def check_bus_load(self, rate_hz: float, bitrate: int, heartbeat: float) -> float:
+    def check_bus_load(self, rate_hz: float, timing: BusTiming, heartbeat: float) -> float:
         """Return the bus load of a cycle.
 
         Raises BusError, which states the highest possible rate, if the load exceeds 1.0.
         """
-        load = self.bus_load(rate_hz, bitrate, heartbeat)
+        load = self.bus_load(rate_hz, timing, heartbeat)
         if load > 1.0:
             raise BusError(
-                f"{rate_hz:g} Hz takes {load:.0%} of the bus at {bitrate} bit/s; "
-                f"the highest rate that fits is {self.highest_rate(bitrate, heartbeat):.0f} Hz"
+                f"{rate_hz:g} Hz takes {load:.0%} of the bus at {timing}; "
+                f"the highest rate that fits is {self.highest_rate(timing, heartbeat):.0f} Hz"
             )
         return load
 

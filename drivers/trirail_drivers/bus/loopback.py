@@ -16,7 +16,7 @@ from struct import Struct
 from types import TracebackType
 from typing import Final, NamedTuple
 
-from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, ERROR, HEADER
+from trirail_drivers.bus.can_frame import CANFD_FRAME, DATA_AT, ERROR, FRAME_SIZES, HEADER
 
 _SO_TIMESTAMPING: Final = 37
 _SO_RCVBUFFORCE: Final = 33
@@ -56,6 +56,7 @@ class Loopback:
             with contextlib.suppress(OSError):
                 self._socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, _FLAGS)
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
             self._socket.bind((channel,))
         except OSError:
             self._socket.close()
@@ -73,7 +74,7 @@ class Loopback:
         """Yield the frames that have arrived, except error frames. Raises OSError if the interface is lost."""
         while True:
             try:
-                packet, ancillary, flags, _ = self._socket.recvmsg(CAN_FRAME.size, _SPACE)
+                packet, ancillary, flags, _ = self._socket.recvmsg(CANFD_FRAME.size, _SPACE)
             except BlockingIOError:
                 return
             frame = parse(packet, ancillary, flags)
@@ -93,7 +94,7 @@ def parse(packet: bytes, ancillary: list[tuple[int, int, bytes]], flags: int) ->
 
     Return None for an error frame and for a packet without a timestamp.
     """
-    if len(packet) != CAN_FRAME.size:
+    if len(packet) not in FRAME_SIZES:
         return None
     identifier, length = HEADER.unpack_from(packet)
     for level, kind, content in ancillary:

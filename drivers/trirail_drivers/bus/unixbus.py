@@ -11,8 +11,8 @@ from pathlib import Path
 
 import can
 
-from trirail_drivers.bus.can_frame import CAN_FRAME
-from trirail_drivers.bus.frames import packed, unpacked
+from trirail_drivers.bus.can_frame import CANFD_FRAME, FRAME_SIZES
+from trirail_drivers.bus.frames import fd_message, is_fd, packed, unpacked
 from trirail_drivers.errors import BusAbsentError, BusError
 
 SEND_BUFFER_BYTES = 1 << 22
@@ -24,10 +24,13 @@ class UnixBus(can.BusABC):
 
     One end listens, and any number of other ends connect. The listening end relays each frame that it receives to all
     peers except the sender. A peer that does not read loses frames, like a CAN controller with a full buffer. Each
-    packet is a `struct can_frame`.
+    packet is a `struct can_frame` or a `struct canfd_frame`. Every end receives both; this emulated bus has no bit
+    rates, and an end does not detect that another end uses another format.
     """
 
-    def __init__(self, channel: str, listen: bool = False, **kwargs: object) -> None:
+    def __init__(self, channel: str, listen: bool = False, fd: bool = False, **kwargs: object) -> None:
+        """If `fd`, this end sends every data frame as a CAN FD frame with bit rate switch."""
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self.channel_info = f"unix {channel}"
         self._path = Path(channel)
         self._peers: dict[int, socket.socket] = {}
@@ -48,7 +51,9 @@ class UnixBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
         """Send a frame to the peers. Raises can.CanOperationError if the listening end is gone or too slow."""
-        if msg.is_fd:
+        if is_fd(self):
+            msg = fd_message(msg)
+        elif msg.is_fd:
             raise can.CanOperationError(f"{self.channel_info}: CAN FD frames cannot be sent; use classical CAN frames")
         packet = packed(msg)
         if self._listener is None:
@@ -116,10 +121,10 @@ class UnixBus(can.BusABC):
     def _read_frame(self, peer: socket.socket) -> None:
         """Read one frame or the end of file from a peer."""
         try:
-            packet = peer.recv(CAN_FRAME.size)
+            packet = peer.recv(CANFD_FRAME.size)
         except ConnectionError:
             packet = b""
-        if len(packet) != CAN_FRAME.size:
+        if len(packet) not in FRAME_SIZES:
             self._epoll.unregister(peer)
             del self._peers[peer.fileno()]
             peer.close()

@@ -13,11 +13,12 @@ from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.can_frame import ERROR, EXTENDED_BITS
 from trirail_drivers.bus.frame_calls import lendable_frames
 from trirail_drivers.bus.frame_io import frame_io
-from trirail_drivers.bus.frames import BITS, Frame
+from trirail_drivers.bus.frames import Frame, is_fd
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Clock, DriveFault
+from trirail_drivers.timing import MOST_DATA, BusTiming
 
 MAX_FRAMES = 1000
 """Maximum number of frames that one `receive` handles, so that a babbling node cannot block it."""
@@ -44,7 +45,9 @@ class Wire:
     It latches the first fault since the last reset; `stop` is called when a fault is latched.
     """
 
-    def __init__(self, bus: can.BusABC, stop: Callable[[], None], reopening: Reopening | None = None) -> None:
+    def __init__(
+        self, bus: can.BusABC, timing: BusTiming, stop: Callable[[], None], reopening: Reopening | None = None
+    ) -> None:
         """`reopening` reopens a lost bus; without `reopening`, a lost bus stays lost."""
         self.bus = bus
         """Bus for use outside the cycle, during set-up and closing."""
@@ -53,7 +56,8 @@ class Wire:
         self._name = reopening.name if reopening is not None else str(bus.channel_info)
         self._reopening = reopening
         self.traffic = 0
-        """Number of bits of all frames sent and received, each with worst-case stuffing."""
+        """Duration of all frames sent and received, each with worst-case stuffing [ns]."""
+        self._frames_ns = timing.frames_ns
         self._frames = lendable_frames(frame_io(bus))
         self.fault: DriveFault | None = None
         self._stop = stop
@@ -156,6 +160,11 @@ class Wire:
         return self._reopening is not None
 
     @property
+    def fd(self) -> bool:
+        """Whether data frames are sent as CAN FD frames."""
+        return is_fd(self.bus)
+
+    @property
     def access(self) -> BusAccess:
         """Bus access for compiled code."""
         return self._frames.access
@@ -200,7 +209,7 @@ class Wire:
                 self._handle_send_error(error)
             return False
         self._sent = True
-        self.traffic += frame.bits
+        self.traffic += self._frames_ns[frame.length]
         return True
 
     def _handle_send_error(self, error: Exception) -> None:
@@ -237,7 +246,7 @@ class Wire:
         if identifier & ERROR:
             self._handle_error_frame(canerrors.decode_error_frame(identifier & EXTENDED_BITS, data))
             return
-        self.traffic += BITS[min(len(data), 8)]
+        self.traffic += self._frames_ns[min(len(data), MOST_DATA)]
         if self._trial is not None:  # a received frame proves that the bus is working again
             self._end_trial()
         entry = self._handlers.get(identifier)  # none for 29-bit identifiers and remote frames, which have flags

@@ -5,7 +5,7 @@ from __future__ import annotations
 from struct import Struct
 from typing import Final, Literal
 
-from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.load import Traffic
 from trirail_drivers.interface import PowerState
 
@@ -140,16 +140,12 @@ def controlword(state: PowerState, wanted: TargetState) -> int:
     return DISABLE_VOLTAGE
 
 
-def _background(heartbeat: float) -> float:
-    """Return the bits per second of the repeated statuswords and of four heartbeats with the given period [s]."""
-    return 3 * frame_bits(STATUSWORD.size) / STATUS_PERIOD + 4 * frame_bits(NMT_STATE.size) / heartbeat
-
-
 TRAFFIC: Final = Traffic(
-    cycle_bits=frame_bits(0) + 3 * frame_bits(SETPOINT.size) + 3 * frame_bits(POSITION.size),
-    background=_background,
+    cycle=(0, *(3 * (SETPOINT.size, POSITION.size))),
+    periodic=3 * ((STATUSWORD.size, STATUS_PERIOD),),
+    heartbeats=4 * (NMT_STATE.size,),
     most_sent=11,
-    output_bits=frame_bits(OUTPUTS.size),
+    output=OUTPUTS.size,
 )
 """Traffic of one cycle: SYNC, three setpoints, three positions.
 

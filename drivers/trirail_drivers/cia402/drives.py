@@ -33,6 +33,7 @@ from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
+from trirail_drivers.timing import BusTiming
 
 REPEAT_AFTER = 3
 """Number of SYNCs after which a controlword that had no effect is sent again, since its frame may have been lost."""
@@ -44,14 +45,14 @@ class Cia402(Driver[Cia402Axis]):
     def __init__(
         self,
         bus: can.BusABC,
-        bitrate: int,
+        timing: BusTiming,
         drives: config.Drives,
         clock: Clock = time.monotonic,
         reopening: Reopening | None = None,
         io: Sequence[DigitalIo] = NO_IO,
     ) -> None:
         """`reopening` reopens a lost bus; `io` contains the digital outputs and inputs of each drive."""
-        super().__init__(bus, bitrate, drives, clock, Cia402Axis, reopening=reopening, io=io)
+        super().__init__(bus, timing, drives, clock, Cia402Axis, reopening=reopening, io=io)
         self._other_masters = OtherMasters(self._wire, self._axes, drives.master_node)
         for axis in self._axes:
             self._listen(axis)
@@ -82,7 +83,7 @@ class Cia402(Driver[Cia402Axis]):
         `reset` clears it.
         """
         io = [axis.io for axis in self._axes]
-        plan = process_data.plan_traffic(self._drives, io, 1.0 / period, self._bitrate)
+        plan = process_data.plan_traffic(self._drives, io, 1.0 / period, self._timing)
         self._check_plan(period, plan)
         for axis in self._axes:
             exchange = process_data.default_exchange(axis.node, axis.io, velocity_offset=plan.velocity_offset)
@@ -97,7 +98,7 @@ class Cia402(Driver[Cia402Axis]):
             ReturningCia402(axis, one, fastest, partial(self._rejoin_drive, number), lambda: recovery.setups)
             for number, (axis, one) in enumerate(zip(self._axes, ones, strict=True))
         ]
-        self._recovery = recovery = Recovery(self._wire, period * self._bitrate, each)
+        self._recovery = recovery = Recovery(self._wire, period * self._timing.bitrate, each)
         for axis, returning, result in zip(self._axes, each, done, strict=True):
             if result is None:
                 axis.silent, axis.homed = True, False
@@ -323,16 +324,17 @@ class Cia402(Driver[Cia402Axis]):
             return None
         lent, beats = self._tables, len(self._beats)
         if not len(lent.end):
-            lent.begin, lent.beats, lent.setpoints = map(packed_frames, ([self._sync], self._beats, self._setpoints))
-            lent.outputs = packed_frames(self._outputs)
+            packed = partial(packed_frames, fd=self._wire.fd)
+            lent.begin, lent.beats, lent.setpoints = map(packed, ([self._sync], self._beats, self._setpoints))
+            lent.outputs = packed(self._outputs)
             lent.end = lent.setpoints.headers
-        lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NO_OFFSET, lent.times[0]["traffic"]
+        lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NO_OFFSET, *lent.counts
         words = [(axis.controlword, axis.statusword, axis.inputs) for axis in self._axes]
         if words != self._lent_state:
             self._lent_state = words
             for axis, frame in zip(self._axes, self._setpoints, strict=True):
                 axis.exchange.setpoints.fill(frame, *axis.setpoint, axis.controlword)
-            lent.setpoints.fill(self._setpoints)
+            lent.setpoints.fill(self._setpoints, fd=self._wire.fd)
             lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected_rows(number)])
         return lent
 

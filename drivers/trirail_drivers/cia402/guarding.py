@@ -1,6 +1,7 @@
 """Set-up of the mutual supervision of drive and service, and of the drive's EMCY (CiA 301).
 
-Drive and service supervise each other by heartbeats, or by node guarding if the drive has no heartbeat consumer.
+Drive and service supervise each other by heartbeats, or by node guarding if the drive has no heartbeat consumer. Node
+guarding needs remote frames, so a CAN FD bus needs the heartbeat consumer.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from typing import Final, NamedTuple
 
 import can
 
-from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.frames import Frame, is_fd
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import title
@@ -38,11 +39,15 @@ class Supervision(NamedTuple):
 
 async def configure_watchdogs(drive: Differences, drives: Drives, period: int, node: int) -> Supervision:
     """Configure the mutual supervision of drive and service with a heartbeat or guarding `period` [ms]."""
-    guarded = not await drive.remote.has(0x1016, 1) and await _configure_guarding(drive, period, node)
+    consumes, fd = await drive.remote.has(0x1016, 1), is_fd(drive.remote.client.bus)
+    guarded = not (consumes or fd) and await _configure_guarding(drive, period, node)
     heard = True
     if not guarded:
         heard = await drive.ensure(0x1017, 0, period) is not None
-        await _watch_master(drive, drives.master_node, MISSED * period)
+        if consumes or not fd:
+            await _watch_master(drive, drives.master_node, MISSED * period)
+        else:
+            drive.lack((0x1016, 1), "it has no such object, and CAN FD has no remote frames for node guarding instead")
     await drive.ensure(0x1029, 1, 0)  # a drive without its master becomes pre-operational, so that it ignores setpoints
     return Supervision(guarded, heard, await _emergency(drive, drives, node))
 

@@ -10,11 +10,12 @@ import can
 from trirail_drivers.cia402 import canopen_frames, process_data, setup
 from trirail_drivers.cia402.one_drive import SetUp
 from trirail_drivers.cia402.sdo import run_setups
-from trirail_drivers.config import DEFAULT_BITRATE, NO_IO, DigitalIo, Drives
+from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import NAMES, Clock
+from trirail_drivers.timing import DEFAULT_TIMING, BusTiming
 
 
 def inspect(
@@ -26,33 +27,33 @@ def inspect(
     *,
     apply: bool,
     io: Sequence[DigitalIo] = NO_IO,
-    bitrate: int = DEFAULT_BITRATE,
+    timing: BusTiming = DEFAULT_TIMING,
 ) -> list[dict[str, Any]]:
     """Return a description of each drive, with the differences between its values and those that the cycle needs.
 
     `fastest` is the velocity limit of the sliders [m/s], which must fit the drives' units; `io` contains the digital
-    outputs and inputs of each drive, and `bitrate` is that of the bus [bit/s]. "bus_load" is the worst-case load of the
-    bus with the PDOs that the drives can map, or None unless all three drives were read.
+    outputs and inputs of each drive, and `timing` contains the bit rates of the bus. "bus_load" is the worst-case load
+    of the bus with the PDOs that the drives can map, or None unless all three drives were read.
 
     With `apply`, the required values are written to all three drives or, if one of them is refused, to none. The drives
     have no power then and do not store the values permanently. Without `apply`, nothing is written. "refused" contains
     the reason if a drive does not answer or is refused. Raises DriveError if `apply` fails.
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
-    offset = process_data.plan_traffic(drives, io, 1.0 / period, bitrate).velocity_offset
+    offset = process_data.plan_traffic(drives, io, 1.0 / period, timing).velocity_offset
     if apply:
-        results = inspect(bus, drives, period, clock, fastest, apply=False, io=io, bitrate=bitrate)
+        results = inspect(bus, drives, period, clock, fastest, apply=False, io=io, timing=timing)
         refused = dict.fromkeys(each["refused"] for each in results if each["refused"])
         raise_combined([DriveError(text) for text in refused])
         tasks = setup.setup_tasks(bus, drives, scales, period, clock, io, velocity_offset=offset)
         made = [result[0] for result in setup.configure(bus, drives, tasks, fastest) if result is not None]
         for drive in drives.each:
             bus.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node).message())
-        load = _bus_load(made, drives, period, bitrate)
+        load = _bus_load(made, drives, period, timing)
         return [_as_json(each, load) for each in made]
     ends = setup.survey(bus, drives, scales, period, clock, fastest, io, velocity_offset=offset)
     looked = [end for end in ends if not isinstance(end, DriveError)]
-    load = _bus_load(looked, drives, period, bitrate)
+    load = _bus_load(looked, drives, period, timing)
     results = [
         {"name": name, "node": drive.node, "refused": str(end)} if isinstance(end, DriveError) else _as_json(end, load)
         for name, drive, end in zip(NAMES, drives.each, ends, strict=True)
@@ -84,10 +85,10 @@ def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int
     return read
 
 
-def _bus_load(made: Sequence[SetUp], drives: Drives, period: float, bitrate: int) -> float | None:
+def _bus_load(made: Sequence[SetUp], drives: Drives, period: float, timing: BusTiming) -> float | None:
     if len(made) < len(NAMES):
         return None
-    return process_data.traffic(each.exchange for each in made).bus_load(1.0 / period, bitrate, drives.heartbeat)
+    return process_data.traffic(each.exchange for each in made).bus_load(1.0 / period, timing, drives.heartbeat)
 
 
 def _as_json(made: SetUp, load: float | None) -> dict[str, Any]:

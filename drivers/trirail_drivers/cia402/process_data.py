@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final
 
-from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.load import HIGH_LOAD, Traffic, TrafficPlan, percent
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.config import NO_IO, DigitalIo, Drives
+from trirail_drivers.timing import BusTiming
 
 INTERPOLATED_POSITION: Final = 7
 CYCLIC_SYNCHRONOUS_POSITION: Final = 8
@@ -196,23 +197,22 @@ def default_exchange(node: int, io: DigitalIo = NO_IO[0], *, velocity_offset: bo
 def traffic(exchanges: Iterable[Exchange]) -> Traffic:
     """Return the bus traffic of the service and of the drives with these exchanges."""
     exchanges = tuple(exchanges)
-    cycle = frame_bits(0) + sum(
-        frame_bits(exchange.setpoints.size) + frame_bits(exchange.feedback.size) for exchange in exchanges
-    )
     repeated = [exchange.status_size for exchange in exchanges if exchange.status]
     repeated += [canopen_frames.INPUTS.size for exchange in exchanges if exchange.inputs not in (None, exchange.status)]
-    status = sum(map(frame_bits, repeated)) / canopen_frames.STATUS_PERIOD
-    polls = sum(2 * frame_bits(8) for exchange in exchanges if exchange.polled) / canopen_frames.POLL_PERIOD
-    lives = frame_bits(1) * (1 + sum(1 + exchange.guarded for exchange in exchanges))
+    polls = 2 * sum(exchange.polled for exchange in exchanges)
     return Traffic(
-        cycle_bits=cycle,
-        background=lambda heartbeat: status + polls + lives / heartbeat,
+        cycle=(0, *(size for exchange in exchanges for size in (exchange.setpoints.size, exchange.feedback.size))),
+        periodic=(
+            *((size, canopen_frames.STATUS_PERIOD) for size in repeated),
+            *(polls * ((8, canopen_frames.POLL_PERIOD),)),
+        ),
+        heartbeats=(1,) * (1 + sum(1 + exchange.guarded for exchange in exchanges)),
         most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
-        output_bits=canopen_frames.TRAFFIC.output_bits,
+        output=canopen_frames.TRAFFIC.output,
     ).with_outputs(sum(exchange.outputs is not None for exchange in exchanges))
 
 
-def plan_traffic(drives: Drives, io: Sequence[DigitalIo], rate_hz: float, bitrate: int) -> TrafficPlan:
+def plan_traffic(drives: Drives, io: Sequence[DigitalIo], rate_hz: float, timing: BusTiming) -> TrafficPlan:
     """Decide whether the setpoints contain the velocity offset, and return the traffic that results.
 
     The decision assumes that every drive has the velocity offset and is the same for all three drives: a drive without
@@ -226,13 +226,13 @@ def plan_traffic(drives: Drives, io: Sequence[DigitalIo], rate_hz: float, bitrat
         )
         for velocity_offset in (True, False)
     )
-    load = full.bus_load(rate_hz, bitrate, drives.heartbeat)
+    load = full.bus_load(rate_hz, timing, drives.heartbeat)
     if drives.velocity_offset == "never":
         return TrafficPlan(short, 4, velocity_offset=False)
     if load <= HIGH_LOAD:
         return TrafficPlan(full)
     if drives.velocity_offset == "always":
-        shorter = short.bus_load(rate_hz, bitrate, drives.heartbeat)
+        shorter = short.bus_load(rate_hz, timing, drives.heartbeat)
         remedy = f'drives.velocity_offset = "auto" uses {percent(shorter)}' if shorter <= 1.0 else ""
         return TrafficPlan(full, remedy=remedy)
     return TrafficPlan(short, 4, velocity_offset=False, full_load=load)

@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import can
+from can.interfaces.socketcan import SocketcanBus
 
 from trirail_drivers import config
 from trirail_drivers.bus import adapters, canerrors
+from trirail_drivers.bus.can_frame import CANFD_FRAME
 from trirail_drivers.bus.capture import Capture, CapturedBus
+from trirail_drivers.bus.frames import fd_message
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.config import NO_IO, DigitalIo
@@ -40,20 +43,25 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
     if section.interface == "simulated":
         return simulated_bus(section, drives, clock)
     if section.interface == "unix":
-        return UnixBus(section.channel)
+        return UnixBus(section.channel, fd=section.fd)
     if section.interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted({"simulated", "unix", *can.VALID_INTERFACES}))
         raise BusError(f'can.interface "{section.interface}" is unknown; use one of {known}')
+    if section.fd and section.interface != "socketcan":
+        raise BusError(no_fd(section))
     options: dict[str, Any] = dict(section.options)
     try:
-        # ignore_config: python-can's own files and environment variables must not change the configured bus.
-        bus = can.Bus(
-            interface=section.interface,
-            channel=section.channel,
-            bitrate=section.bitrate,
-            ignore_config=True,
-            **options,
-        )
+        if section.fd:
+            bus: can.BusABC = FdSocketcanBus(section.channel, **options)
+        else:
+            # ignore_config: python-can's own files and environment variables must not change the configured bus.
+            bus = can.Bus(
+                interface=section.interface,
+                channel=section.channel,
+                bitrate=section.bitrate,
+                ignore_config=True,
+                **options,
+            )
     except Exception as error:  # vendor libraries raise any exception: a missing Kvaser CANlib raises NameError
         kind = BusAbsentError if _may_appear(section, error) else BusError
         raise kind(_opening_error(section, error)) from error
@@ -61,6 +69,25 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
         bus.shutdown()
         raise BusAbsentError(problem)
     return bus
+
+
+def no_fd(section: config.Can) -> str:
+    """Return the reason why an interface cannot be used as a CAN FD bus."""
+    return (
+        f'can.fd = true: interface "{section.interface}" is used for classical CAN only; CAN FD needs interface = '
+        '"socketcan", for which Linux has drivers of most adapters; or set can.fd = false'
+    )
+
+
+class FdSocketcanBus(SocketcanBus):
+    """CAN FD bus on SocketCAN. It sends every data frame as a CAN FD frame with bit rate switch."""
+
+    def __init__(self, channel: str, **options: Any) -> None:
+        super().__init__(channel, **options, fd=True)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame."""
+        super().send(fd_message(msg), timeout)
 
 
 def _may_appear(section: config.Can, error: Exception) -> bool:
@@ -102,7 +129,7 @@ def connect(
             raise
         bus = AbsentBus(reopening.name, str(error))
     try:
-        return protocol.driver(bus, section.bitrate, drives, clock, reopening, io)
+        return protocol.driver(bus, section.timing, drives, clock, reopening, io)
     except DriveError:
         bus.shutdown()
         raise
@@ -111,7 +138,7 @@ def connect(
 def simulated_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> SimulatedBus:
     """Return the three simulated drives of a configuration on their own bus, at rest at `can.simulated.start`."""
     devices, faults = simulated_drives(section, drives)
-    return SimulatedBus(devices, clock, faults)
+    return SimulatedBus(devices, clock, faults, fd=section.fd)
 
 
 def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequence[SimulatedDevice], Faults]:
@@ -151,8 +178,9 @@ def _opening_error(section: config.Can, error: Exception) -> str:
 
 def _interface_up_hint(section: config.Can) -> str:
     if section.channel.startswith("vcan"):
-        return f"make it with: ip link add {section.channel} type vcan && ip link set {section.channel} up"
-    return f"bring it up with: ip link set {section.channel} up type can bitrate {section.bitrate}"
+        mtu = f" mtu {CANFD_FRAME.size}" if section.fd else ""
+        return f"make it with: ip link add {section.channel} type vcan && ip link set {section.channel}{mtu} up"
+    return f"bring it up with: ip link set {section.channel} {section.timing.link_settings}"
 
 
 def _problem(section: config.Can) -> str:
@@ -160,11 +188,17 @@ def _problem(section: config.Can) -> str:
     folder = NETWORK_INTERFACES / section.channel
     try:
         flags = int((folder / "flags").read_text(), 16)
+        mtu = int((folder / "mtu").read_text()) if section.fd else 0
         carrier = int((folder / "carrier").read_text()) if flags & IFF_UP else 0
     except (OSError, ValueError):
         return ""
     if not flags & IFF_UP:
         return f'CAN interface "{section.channel}" is down; {_interface_up_hint(section)}'
+    if section.fd and mtu < CANFD_FRAME.size:
+        return (
+            f'CAN interface "{section.channel}" is set up for classical CAN only (MTU {mtu}), but can.fd = true; set '
+            f"the interface down, and {_interface_up_hint(section)}; or set can.fd = false"
+        )
     if not carrier:  # a CAN controller lacks its carrier only in bus-off: drivers/net/can/dev/dev.c, can_bus_off
         return (
             f'CAN interface "{section.channel}" is in bus-off; check cable, termination and bitrate, then restart it: '

@@ -13,8 +13,9 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from trirail_drivers import config
-from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.can_frame import CAN_FRAME, CANFD_FRAME, DATA_AT, FRAME_SIZES, HEADER
 from trirail_drivers.bus.frame_io import SO_TIMESTAMPNS, TIMESPEC, TIMESPEC_SPACE
+from trirail_drivers.bus.frames import fd_packed
 from trirail_drivers.bus.unixbus import widen_send_buffer
 from trirail_drivers.connection.opening import simulated_drives
 from trirail_drivers.protocols import PROTOCOLS
@@ -36,8 +37,6 @@ def serve(
     The path appears once the socket accepts connections. `ready` is called just before the path appears, `connected`
     when the client has connected.
     """
-    devices, faults = simulated_drives(section, drives)
-    states = frozenset[int]().union(*(PROTOCOLS[drives.protocol].states(each.node) for each in devices))
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listening:
         unready = path.with_name(f"{path.name}.new")
         listening.bind(str(unready))
@@ -46,10 +45,22 @@ def serve(
         unready.rename(path)
         accepted, _ = listening.accept()
     with accepted:
-        master = _Master(accepted, states)
-        connected()
-        with contextlib.suppress(ConnectionError):
-            master.exchange(SimulatedExchange(devices, master.clock, faults, master.emit))
+        exchange(accepted, section, drives, connected)
+
+
+def exchange(
+    connection: socket.socket, section: config.Can, drives: config.Drives, connected: Callable[[], None]
+) -> None:
+    """Connect the drives of a configuration to a master over a socket, which may also be a SocketCAN socket.
+
+    `connected` is called when frames can be received. Return when the other end has disconnected.
+    """
+    devices, faults = simulated_drives(section, drives)
+    states = frozenset[int]().union(*(PROTOCOLS[drives.protocol].states(each.node) for each in devices))
+    master = _Master(connection, states, fd=section.fd)
+    connected()
+    with contextlib.suppress(ConnectionError):
+        master.exchange(SimulatedExchange(devices, master.clock, faults, master.emit))
 
 
 class _Master:
@@ -60,8 +71,12 @@ class _Master:
     answer, only the newest is sent, at the end: otherwise the master would take an old position for a current one.
     """
 
-    def __init__(self, connection: socket.socket, states: Collection[int]) -> None:
-        """`states` contains the identifiers of frames that a newer frame with the same identifier replaces."""
+    def __init__(self, connection: socket.socket, states: Collection[int], *, fd: bool) -> None:
+        """`states` contains the identifiers of frames that a newer frame with the same identifier replaces.
+
+        If `fd`, the drives send CAN FD frames.
+        """
+        self._fd = fd
         self._socket = connection
         self._states = states
         self._held: dict[int, bytes] = {}
@@ -79,6 +94,8 @@ class _Master:
     def emit(self, identifier: int, data: bytes) -> None:
         """Send a drive's frame; a state frame is sent only after the waiting frames of the master."""
         frame = CAN_FRAME.pack(identifier, len(data), data)
+        if self._fd:
+            frame = fd_packed(frame)
         if identifier in self._states:
             self._held[identifier] = frame
         else:
@@ -86,8 +103,8 @@ class _Master:
 
     def exchange(self, drives: SimulatedExchange) -> None:
         """Pass frames and time to the drives until the master disconnects."""
-        packet = bytearray(CAN_FRAME.size)
-        receive, buffers, unpack = self._socket.recvmsg_into, [packet], CAN_FRAME.unpack
+        packet = bytearray(CANFD_FRAME.size)
+        receive, buffers, unpack = self._socket.recvmsg_into, [packet], HEADER.unpack_from
         due = self._now
         while True:
             try:
@@ -96,14 +113,14 @@ class _Master:
                 self._send_held()
                 now = time.monotonic()
             else:
-                if size != CAN_FRAME.size:
+                if size not in FRAME_SIZES:
                     return
                 seconds, nanoseconds = TIMESPEC.unpack(stamped[0][2])
                 waited = time.time() - seconds - nanoseconds * 1e-9
                 now = max(self._now, time.monotonic() - max(0.0, waited))
-                identifier, length, data = unpack(packet)
+                identifier, length = unpack(packet)
                 self._now = now
-                drives.receive(identifier, data[:length], now)
+                drives.receive(identifier, bytes(packet[DATA_AT : DATA_AT + length]), now)
             if now >= due:
                 due = now + POLL_PERIOD_S
                 self._now = now

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from functools import partial
 
 from trirail_drivers.config import Can, Drives
+from trirail_drivers.connection.opening import no_fd
 from trirail_drivers.driver.requirements import Requirements, Rule
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
@@ -13,15 +14,19 @@ from trirail_drivers.protocols import PROTOCOLS
 
 _OWN_INTERFACES = ("simulated", "unix")
 """Interfaces that do not belong to python-can."""
-_RESERVED_OPTIONS = ("interface", "channel", "bitrate", "ignore_config", "config_context")
+_RESERVED_OPTIONS = ("interface", "channel", "bitrate", "fd", "data_bitrate", "ignore_config", "config_context")
 """Arguments of `can.Bus` that are set from other keys or must not be set."""
 MAX_CLASSICAL_BITRATE = 1_000_000
-"""Highest bit rate of classical CAN (ISO 11898-2) [bit/s]."""
+"""Highest bit rate of classical CAN, and of the arbitration of CAN FD (ISO 11898-2) [bit/s]."""
 
 
-def bus_rules(section: Can) -> Iterator[Rule]:
-    """Yield checks for a bit rate above that of classical CAN, and for options that python-can does not accept."""
+def bus_rules(section: Can, protocol: str) -> Iterator[Rule]:
+    """Yield checks for a bit rate above that of classical CAN, for CAN FD where it is not possible, and for options
+    that python-can does not accept.
+    """
     yield Rule("can.bitrate", ("can.interface",), partial(_check_bitrate, section))
+    yield Rule("can.fd", ("can.interface", "drives.protocol"), partial(_check_fd, section, protocol))
+    yield Rule("can.data_bitrate", ("can.fd", "can.bitrate"), partial(_check_data_bitrate, section))
     for name in section.options:
         yield Rule(f"can.options.{name}", ("can.interface",), partial(_check_option, section, name))
 
@@ -56,13 +61,36 @@ def _check_bitrate(section: Can) -> None:
         )
 
 
+def _check_fd(section: Can, protocol: str) -> None:
+    if not section.fd:
+        return
+    if section.interface not in (*_OWN_INTERFACES, "socketcan"):
+        raise DriveError(no_fd(section))
+    if reason := PROTOCOLS[protocol].without_fd:
+        raise DriveError(f'can.fd = true: not with drives.protocol = "{protocol}": {reason}; set can.fd = false')
+
+
+def _check_data_bitrate(section: Can) -> None:
+    if section.data_bitrate is None:
+        return
+    if not section.fd:
+        raise DriveError(
+            f"can.data_bitrate = {section.data_bitrate}: only CAN FD frames have a data bit rate; set can.fd = true, "
+            "or omit can.data_bitrate"
+        )
+    if section.data_bitrate < section.bitrate:
+        raise DriveError(
+            f"can.data_bitrate = {section.data_bitrate}: expected at least can.bitrate, {section.bitrate} bit/s"
+        )
+
+
 def _check_option(section: Can, name: str) -> None:
     if section.interface in _OWN_INTERFACES:
         raise DriveError(
             f'can.options.{name}: "{section.interface}" has no options; only interfaces of python-can have options'
         )
     if name in _RESERVED_OPTIONS:
-        raise DriveError(f"can.options.{name}: not allowed here; set interface, channel and bitrate in [can]")
+        raise DriveError(f"can.options.{name}: not allowed here; set interface, channel, bitrates and fd in [can]")
 
 
 def _check_io(key: str, protocol: str) -> None:

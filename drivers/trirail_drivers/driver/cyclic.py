@@ -16,9 +16,13 @@ from numpy.typing import NDArray
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET
 from trirail_drivers.interface import Feedback
+from trirail_drivers.timing import BusTiming
 
 MOST_FRAMES: Final = 32
 """Maximum number of frames received in one call; a quiet cycle has fewer."""
+
+MOST_LENGTH: Final = 8
+"""Maximum data length of a frame in a quiet cycle [bytes]."""
 
 EXPECTED = np.dtype(
     [
@@ -43,7 +47,8 @@ TIMES = np.dtype(
         ("beats", "<i8"),  # number of these frames sent together
         ("next_beat", "<i8"),  # index of the next of these frames
         ("begun", "<i8"),  # frames sent at the start of the newest cycle before one was refused; NO_OFFSET if none
-        ("traffic", "<i8"),  # bits on the bus in quiet cycles since the start
+        ("traffic", "<i8"),  # duration of the frames of quiet cycles since the start [ns]
+        ("frame_ns", "<i8", MOST_LENGTH + 1),  # duration of a frame of each data length [ns]
     ],
     align=True,
 )
@@ -72,12 +77,13 @@ class Cyclic:
     They always contain the state of the drives; the frames are filled in when the tables are lent.
     """
 
-    def __init__(self, bus: BusAccess, history: int) -> None:
+    def __init__(self, bus: BusAccess, history: int, timing: BusTiming) -> None:
         """`history`: number of sent setpoints to keep."""
         self.bus = np.array(bus, np.int64)
         """A BusAccess, (3,)."""
         self.axes: NDArray[np.void] = np.zeros(3, AXIS)
         self.times: NDArray[np.void] = np.zeros(1, TIMES)
+        self.times["frame_ns"] = timing.frames_ns[: MOST_LENGTH + 1]
         self.expected: NDArray[np.void] = np.zeros(0, EXPECTED)
         self.begin = self.beats = self.setpoints = self.outputs = PackedFrames(0)
         """Tables of frames to send: `begin` at the start of a cycle, then the periodic frames `beats` that are due,
@@ -92,6 +98,11 @@ class Cyclic:
         """Positions commanded at each SYNC [m], (history, 3); SYNC n is in row n % history. NaN if none was commanded.
         """
         self.arrived = PackedFrames(MOST_FRAMES)
+
+    @property
+    def counts(self) -> tuple[Any, ...]:
+        """Last two fields of `times`, which a driver does not change."""
+        return self.times[0]["traffic"], self.times[0]["frame_ns"]
 
     def expect(self, rows: Sequence[tuple[Any, ...]]) -> None:
         """Replace the expected frames with the given rows of EXPECTED."""

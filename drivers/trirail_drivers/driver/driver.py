@@ -12,7 +12,6 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.bus import load
-from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import NO_IO, DigitalIo
@@ -23,6 +22,7 @@ from trirail_drivers.driver.refusals import SetUpDrive, merge_notes
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection, Unready, UnreadyDrives
+from trirail_drivers.timing import BusTiming
 
 Result = TypeVar("Result")
 
@@ -37,7 +37,7 @@ class Driver(ABC, Generic[AnyAxis]):
     def __init__(
         self,
         bus: can.BusABC,
-        bitrate: int,
+        timing: BusTiming,
         drives: config.Drives,
         clock: Clock,
         axis: type[AnyAxis],
@@ -49,11 +49,11 @@ class Driver(ABC, Generic[AnyAxis]):
         digital outputs and inputs of each drive.
         """
         self.bus_load = 0.0
-        self._wire = Wire(bus, self._stop, reopening)
-        self._bitrate = bitrate
+        self._wire = Wire(bus, timing, self._stop, reopening)
+        self._timing = timing
         self._drives = drives
         self._clock = clock
-        self._tables = Cyclic(self._wire.access, history)
+        self._tables = Cyclic(self._wire.access, history, timing)
         self._axes = tuple(
             axis.in_row(self._tables.axes, number, name, drive.node, scale_of(name, drive), drives)
             for number, (name, drive) in enumerate(zip(NAMES, drives.each, strict=True))
@@ -143,7 +143,7 @@ class Driver(ABC, Generic[AnyAxis]):
 
     @property
     def traffic(self) -> int:
-        """Number of bits in all frames sent and received since the start, with worst-case bit stuffing."""
+        """Duration of all frames sent and received since the start, with worst-case bit stuffing [ns]."""
         return self._wire.traffic + int(self._tables.times[0]["traffic"])
 
     @property
@@ -205,14 +205,14 @@ class Driver(ABC, Generic[AnyAxis]):
         Raises BusError if the cycle's frames do not fit on the bus; emits a warning if they leave little room.
         """
         rate = 1.0 / period
-        self.bus_load = traffic.check_bus_load(rate, self._bitrate, self._drives.heartbeat)
+        self.bus_load = traffic.check_bus_load(rate, self._timing, self._drives.heartbeat)
         self._period = period
         if warning := load.warning(rate, self.bus_load):
             self._wire.warn(warning)
 
     def _duration(self, frames: int) -> float:
         """Return the longest time for which this number of frames is on the bus [s]."""
-        return frames * frame_bits(8) / self._bitrate
+        return frames * self._timing.frame_ns(8) * 1e-9
 
     def _leaves_room(self, frames: int) -> bool:
         """Return True if this number of frames will not delay the next SYNC, as far as its time is known."""

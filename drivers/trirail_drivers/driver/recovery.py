@@ -54,6 +54,11 @@ class CycleSender:
         """Name of the bus."""
         return str(self._wire.bus.channel_info)
 
+    @property
+    def protocol(self) -> can.CanProtocol:
+        """Protocol of the bus; see FrameSender."""
+        return self._wire.bus.protocol
+
     def send(self, msg: can.Message) -> None:
         """Send a frame."""
         self._wire.send(Frame.from_packed(packed(msg)))

@@ -10,7 +10,7 @@ from enum import IntEnum, IntFlag
 from struct import Struct
 from typing import Final
 
-from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.load import Traffic
 
 # Commands: the lower five bits of an identifier; the node id forms the upper bits.
@@ -212,14 +212,10 @@ def error_names(errors: int) -> str:
     return ", ".join([*names, *([f"unknown error {unknown:08X}"] if unknown else [])])
 
 
-def _background(heartbeat: float) -> float:
-    """Return the bits per second of the error requests, their answers, and three heartbeats with a given period [s]."""
-    return (frame_bits(0) + frame_bits(ERRORS.size)) / ERROR_PERIOD + 3 * frame_bits(BEAT.size) / heartbeat
-
-
 TRAFFIC: Final = Traffic(
-    cycle_bits=3 * (frame_bits(INPUT_POS.size) + frame_bits(0) + frame_bits(ESTIMATES.size)),
-    background=_background,
+    cycle=3 * (INPUT_POS.size, 0, ESTIMATES.size),
+    periodic=((0, ERROR_PERIOD), (ERRORS.size, ERROR_PERIOD)),
+    heartbeats=3 * (BEAT.size,),
     most_sent=13,
 )
 """Traffic of one cycle: three setpoints, three requests, three encoder estimates.

@@ -35,6 +35,7 @@ from trirail_drivers.odrive.protections import describe_protection
 from trirail_drivers.odrive.returning import ReturningOdrive
 from trirail_drivers.odrive.setpoints import SetpointSender
 from trirail_drivers.odrive.setup import OdriveStart
+from trirail_drivers.timing import BusTiming
 
 
 class Odrive(Driver[OdriveAxis]):
@@ -51,14 +52,14 @@ class Odrive(Driver[OdriveAxis]):
     def __init__(
         self,
         bus: can.BusABC,
-        bitrate: int,
+        timing: BusTiming,
         drives: config.Drives,
         clock: Clock = time.monotonic,
         reopening: Reopening | None = None,
         io: Sequence[DigitalIo] = NO_IO,
     ) -> None:
         setup.check_nodes(drives)
-        super().__init__(bus, bitrate, drives, clock, OdriveAxis, drives.missed_positions, reopening, io)
+        super().__init__(bus, timing, drives, clock, OdriveAxis, drives.missed_positions, reopening, io)
         for axis in self._axes:
             for number, handler in (
                 (cansimple.GET_VERSION, axis.ignore_answer),
@@ -98,7 +99,7 @@ class Odrive(Driver[OdriveAxis]):
             ReturningOdrive(axis, one, partial(self._rejoin_drive, axis))
             for axis, one in zip(self._axes, ones, strict=True)
         ]
-        self._recovery = recovery = Recovery(self._wire, period * self._bitrate, each)
+        self._recovery = recovery = Recovery(self._wire, period * self._timing.bitrate, each)
         for axis, returning, result in zip(self._axes, each, done, strict=True):
             if result is None:
                 axis.silent, axis.homed, axis.position = True, False, axis.scale.metres(0.0)
@@ -202,7 +203,7 @@ class Odrive(Driver[OdriveAxis]):
         if not all(axis.is_steady(self._target_state(axis)) for axis in self._axes):
             return None
         times, requests = self._tables.times, (1, self._next_request)
-        times[0] = self._off_deadline, due, cansimple.ERROR_PERIOD, *requests, NO_OFFSET, times[0]["traffic"]
+        times[0] = self._off_deadline, due, cansimple.ERROR_PERIOD, *requests, NO_OFFSET, *self._tables.counts
         self._table_writer.fill(follow=self._enabled, within=self._drives.following_error)
         return self._tables
 

@@ -31,7 +31,7 @@ class CycleTableWriter:
         self._all = packed_frames([*setpoints, *requests])
         self._requests = self._all.part(len(setpoints), len(setpoints) + len(requests))
         tables.beats, tables.setpoints = packed_frames(errors), self._all.part(0, len(setpoints))
-        self._data = [frame[DATA_AT:].data for frame in tables.setpoints.frames]
+        self._data = [frame[DATA_AT : DATA_AT + len(setpoint)].data for frame in tables.setpoints.frames]
         self._expected: list[tuple[int, int]] = []
         """Axis state and procedure result of each drive for which the expected frames were last written."""
 

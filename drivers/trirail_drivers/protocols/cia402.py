@@ -69,6 +69,7 @@ CIA402 = Protocol(
     restore=restore,
     protections={name: describe_protection(name) for name in PROTECTIONS},
     without_io="",
+    without_fd="",
     states=lambda node: {canopen_frames.TPDO1 + node, canopen_frames.TPDO2 + node},
     sync=canopen_frames.SYNC,
     setpoints=range(canopen_frames.RPDO1, canopen_frames.SDO_ANSWER),  # a drive may use any of its RPDOs

@@ -13,6 +13,7 @@ from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.odrive.protections import PROTECTIONS, describe_protection
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedOdrive
+from trirail_drivers.timing import BusTiming
 
 FRICTION: Final = 2.0
 """Deceleration of a simulated ODrive's slider while it coasts [m/s²]."""
@@ -38,7 +39,7 @@ def _plan_traffic(
     drives: config.Drives,  # noqa: ARG001  one signature for all
     io: Sequence[config.DigitalIo],  # noqa: ARG001
     rate_hz: float,  # noqa: ARG001
-    bitrate: int,  # noqa: ARG001
+    timing: BusTiming,  # noqa: ARG001
 ) -> TrafficPlan:
     """Return the traffic of ODrives, which does not depend on the configuration."""
     return TrafficPlan(cansimple.TRAFFIC)
@@ -58,6 +59,7 @@ ODRIVE = Protocol(
     restore=None,
     protections={name: describe_protection(name) for name in PROTECTIONS},
     without_io="CANSimple has no message for an ODrive's GPIO",
+    without_fd="the driver requests each position by a remote frame, which CAN FD does not have",
     states=lambda node: {
         cansimple.identifier(node, cansimple.HEARTBEAT),
         cansimple.identifier(node, cansimple.GET_ENCODER_ESTIMATES),

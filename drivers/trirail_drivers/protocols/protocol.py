@@ -16,6 +16,7 @@ from trirail_drivers.driver.requirements import Requirements, Rule
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.simulated import Frames, SimulatedDevice
+from trirail_drivers.timing import BusTiming
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,7 @@ class Protocol:
     name: str
     """Name in `drives.protocol` of the configuration."""
     driver: Callable[..., DriveGroup]
-    """Function that returns the driver of three drives. Arguments: the bus, its bit rate, section [drives], the clock,
+    """Function that returns the driver of three drives. Arguments: the bus, its BusTiming, section [drives], the clock,
     a Reopening if a lost bus can be reopened, and the digital outputs and inputs of each drive.
     """
     rules: Callable[[config.Drives, Requirements], Iterator[Rule]]
@@ -34,7 +35,7 @@ class Protocol:
     """Function that yields checks that read the files named in the settings."""
     traffic: Traffic
     """Bus traffic of drives with every optional object and without digital outputs and inputs."""
-    plan_traffic: Callable[[config.Drives, Sequence[config.DigitalIo], float, int], TrafficPlan]
+    plan_traffic: Callable[[config.Drives, Sequence[config.DigitalIo], float, BusTiming], TrafficPlan]
     """Function that returns the traffic expected from the configuration. Arguments: section [drives], the digital
     outputs and inputs of each drive, the cycle rate [Hz] and the bit rate [bit/s].
     """
@@ -45,7 +46,7 @@ class Protocol:
     cannot be inspected.
 
     Arguments: the bus, section [drives], the period [s], the clock, the velocity limit of the sliders [m/s], whether to
-    `apply` the changes, the digital outputs and inputs `io` of each drive, and the `bitrate`.
+    `apply` the changes, the digital outputs and inputs `io` of each drive, and the `timing` of the bus.
     """
     save: Callable[..., dict[str, SavedParameters | DriveError]] | None
     """Function that reads the parameters of drives; None if the drives have no object dictionary.
@@ -65,6 +66,8 @@ class Protocol:
     """
     without_io: str
     """Reason why the drives have no digital outputs and inputs in the cycle; "" if they have them."""
+    without_fd: str
+    """Reason why the drives cannot be used on a CAN FD bus; "" if they can."""
     states: Callable[[int], set[int]]
     """Function that returns the CAN identifiers of the state frames of a node."""
     sync: int | None

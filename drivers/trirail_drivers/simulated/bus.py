@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import can
 
 from trirail_drivers.bus.can_frame import CAN_FRAME
-from trirail_drivers.bus.frames import can_id, unpacked
+from trirail_drivers.bus.frames import can_id, fd_packed, is_fd, unpacked
 from trirail_drivers.interface import Clock
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.exchange import SimulatedExchange
@@ -28,8 +28,11 @@ class SimulatedBus(can.BusABC):
         drives: Sequence[SimulatedDevice],
         clock: Clock,
         faults: Faults,
+        *,
+        fd: bool = False,
     ) -> None:
-        """Connect the drives to the bus; `faults` act on these drives."""
+        """Connect the drives to the bus; `faults` act on these drives. If `fd`, the drives send CAN FD frames."""
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self.drives = tuple(drives)
         self.faults = faults
         self.channel_info = "simulated drives"
@@ -51,7 +54,8 @@ class SimulatedBus(can.BusABC):
             raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
 
     def _emit(self, identifier: int, data: bytes) -> None:
-        self._arrived.append(unpacked(CAN_FRAME.pack(identifier, len(data), data), time.time()))
+        frame = CAN_FRAME.pack(identifier, len(data), data)
+        self._arrived.append(unpacked(fd_packed(frame) if is_fd(self) else frame, time.time()))
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         deadline = None if timeout is None else time.monotonic() + timeout

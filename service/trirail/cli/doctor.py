@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from trirail_drivers.bus.frames import bits_of
+from trirail_drivers.bus.can_frame import CANFD_FRAME
 from trirail_drivers.bus.load import HIGH_LOAD
+from trirail_drivers.config import Can
 
 from trirail.cli import notation
 from trirail.cli.doctor_cycle import cycle, on_bus
@@ -244,21 +245,24 @@ def can_interface(config: Config, machine: Machine) -> list[Check]:
 
 
 def _link(config: Config, machine: Machine) -> list[Check]:
-    name, bitrate, link = config.can.channel, config.can.bitrate, machine.link
+    name, section, link = config.can.channel, config.can, machine.link
     virtual = name.startswith("vcan")
-    up = f"ip link set {name} up" + ("" if virtual else f" type can bitrate {bitrate}")
+    mtu = f"mtu {CANFD_FRAME.size} " if section.fd else ""
+    up = f"ip link set {name} {f'{mtu}up' if virtual else section.timing.link_settings}"
     if link is None:
         make = f"ip link add {name} type vcan && {up}" if virtual else "plug the adapter in, load its driver"
         return [Check(name, "failure", "no such interface", make)]
     if "UP" not in link.get("flags", ()):
         return [Check(name, "failure", "down", up)]
+    if section.fd and link.get("mtu", CANFD_FRAME.size) < CANFD_FRAME.size:
+        return [Check(name, "failure", "up for classical CAN only; can.fd is true", f"ip link set {name} down && {up}")]
     info = link.get("linkinfo", {})
     if info.get("info_kind") == "vcan":
         return [Check(name, "ok", "up; virtual, without bitrate and error states")]
     data = info.get("info_data", {})
     queue = _queue(name, link.get("txqlen"), plan_traffic(config).traffic.most_sent)
     return [
-        _bitrate(name, bitrate, data, up),
+        _bitrate(name, section, data, up),
         _state(name, data, up),
         queue,
         *_coalescing(name, machine.coalescing, up),
@@ -269,22 +273,25 @@ def _traffic(config: Config, passed: BusTraffic | None) -> list[Check]:
     """Report the current traffic of all nodes on the bus; the service counts only the frames of its own drives."""
     if passed is None:
         return []
-    share = bits_of(passed.frames, passed.data) / passed.seconds / config.can.bitrate
+    share = config.can.timing.total_seconds(passed.frames, passed.data) / passed.seconds
     name = f"{config.can.channel} traffic"
-    load = (
-        f"{share:.1%} of {config.can.bitrate} bit/s, {passed.frames} frames in {passed.seconds:.1f} s, from all nodes"
-    )
+    load = f"{share:.1%} of {config.can.timing}, {passed.frames} frames in {passed.seconds:.1f} s, from all nodes"
     if share <= HIGH_LOAD:
         return [Check(name, "ok", load)]
     return [Check(name, "warning", load, f"find out which node sends: candump {config.can.channel}")]
 
 
-def _bitrate(name: str, bitrate: int, data: dict[str, Any], up: str) -> Check:
-    actual = data.get("bittiming", {}).get("bitrate")
-    if actual == bitrate:
-        return Check(f"{name} bitrate", "ok", f"{bitrate} bit/s")
+def _bitrate(name: str, section: Can, data: dict[str, Any], up: str) -> Check:
     remedy = f"ip link set {name} down && {up}; the drives must have the same bitrate"
-    return Check(f"{name} bitrate", "failure", f"{actual} bit/s; can.bitrate is {bitrate}", remedy)
+    wanted = {"bitrate": section.timing.bitrate, "data_bitrate": section.timing.data_bitrate}
+    actual = {
+        "bitrate": data.get("bittiming", {}).get("bitrate"),
+        "data_bitrate": data.get("data_bittiming", {}).get("bitrate"),
+    }
+    for key, value in wanted.items():
+        if value is not None and actual[key] != value:
+            return Check(f"{name} bitrate", "failure", f"{actual[key]} bit/s; can.{key} is {value}", remedy)
+    return Check(f"{name} bitrate", "ok", str(section.timing))
 
 
 def _state(name: str, data: dict[str, Any], up: str) -> Check:

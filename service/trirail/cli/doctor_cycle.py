@@ -8,7 +8,7 @@ from trirail.cli.terminal import budget_share
 from trirail.config import Config
 from trirail.diagnosis import Check
 from trirail.diagnosis.bare_loop import Cycles, compute_percentiles
-from trirail.diagnosis.bus_timing import BusTiming
+from trirail.diagnosis.bus_timing import MeasuredTiming
 from trirail.diagnosis.drive_checks import setpoint_budget_us
 from trirail.wire.state import Percentiles
 
@@ -92,7 +92,7 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
     return Check("cycle", "ok", f"{summary}: fine; up to {_frequency(held.up_to_hz or held.rate_hz)}")
 
 
-def on_bus(timing: BusTiming | str, config: Config) -> list[Check]:
+def on_bus(timing: MeasuredTiming | str, config: Config) -> list[Check]:
     """Check the timing of cycles on the bus, if it was measured: each setpoint must be sent before the next SYNC."""
     name = f"{config.can.channel} timing"
     if isinstance(timing, str):

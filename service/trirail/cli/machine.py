@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from trirail.cli.key_folder import IssuedCertificate
 from trirail.diagnosis.bare_loop import Cycles
-from trirail.diagnosis.bus_timing import BusTiming
+from trirail.diagnosis.bus_timing import MeasuredTiming
 from trirail.processes.session_guard import Guard
 
 
@@ -55,7 +55,7 @@ class Machine(Struct, frozen=True):
     """Timing of cycles that only exchange frames, or the reason why it was not measured; "" if not requested."""
     traffic: BusTraffic | None = None
     """Traffic on the CAN interface during the measurement."""
-    bus_timing: BusTiming | str = ""
+    bus_timing: MeasuredTiming | str = ""
     """Timing of cycles on the SocketCAN interface, or the reason why it was not measured; "" if not requested."""
     coalescing: ReceiveCoalescing | None = None
     """Receive coalescing of the CAN interface; None if its driver does not report it."""

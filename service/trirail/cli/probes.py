@@ -20,13 +20,14 @@ from typing import Any
 from msgspec import structs
 from trirail_drivers.bus import adapters
 from trirail_drivers.protocols import PROTOCOLS
+from trirail_drivers.timing import BusTiming
 
 from trirail.cli.key_folder import AUTHORITY_KEY, IssuedCertificate, KeyFolder
 from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import Config, LoopTable
 from trirail.diagnosis import bare_loop, bus_timing
 from trirail.diagnosis.bare_loop import Cycles
-from trirail.diagnosis.bus_timing import BusTiming
+from trirail.diagnosis.bus_timing import MeasuredTiming
 from trirail.errors import ServiceError
 from trirail.processes import realtime
 from trirail.processes.operating_system import title
@@ -67,7 +68,7 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         time.sleep(COUNTING_S)
     traffic = traffic_between(before, read_counters(channel))
     reported = link(channel) if channel else None
-    timing: BusTiming | str = ""
+    timing: MeasuredTiming | str = ""
     if not quick and reported is not None and "UP" in reported.get("flags", ()):
         with _rights_of(config.loop):
             timing = measure_bus(config, reported, progress)
@@ -99,26 +100,28 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
 
 def measure_bus(
     config: Config, report: dict[str, Any], progress: Callable[[float], None] | None = None
-) -> BusTiming | str:
+) -> MeasuredTiming | str:
     """Measure the timing of cycles on the configuration's SocketCAN interface, or return why that is not possible.
 
     `report` is the kernel's report on the interface, from `link`.
     """
     protocol, can = PROTOCOLS[config.drives.protocol], config.can
     identifiers = protocol.sync, protocol.setpoints
-    return bus_timing.measure(can.channel, can.bitrate, config.loop, *identifiers, unfit(report, can.bitrate), progress)
+    return bus_timing.measure(can.channel, can.timing, config.loop, *identifiers, unfit(report, can.timing), progress)
 
 
-def unfit(report: dict[str, Any], bitrate: int) -> str:
+def unfit(report: dict[str, Any], timing: BusTiming) -> str:
     """Return why nothing must be sent on an interface, given the kernel's report on it, or "".
 
-    At another bit rate than that of the drives, even one frame would disturb the bus.
+    At another bit rate than that of the drives, even one frame would disturb the bus. Test frames are classical frames.
     """
+    if timing.fd:
+        return "no service runs on it, and test frames are not sent on a CAN FD bus"
     info = report.get("linkinfo", {})
     data = info.get("info_data", {})
     if info.get("info_kind") == "vcan":
         return ""
-    if data.get("bittiming", {}).get("bitrate") != bitrate:
+    if data.get("bittiming", {}).get("bitrate") != timing.bitrate:
         return "no service runs on it, and its bit rate is not can.bitrate, so no test frames were sent"
     if data.get("state") != "ERROR-ACTIVE":
         return "no service runs on it, and it is not error-active, so no test frames were sent"

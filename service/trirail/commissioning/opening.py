@@ -78,7 +78,7 @@ def open_steps(
 
         def make_bench() -> Bench:
             nonlocal driver
-            driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.bitrate, config.drives, clock)
+            driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.timing, config.drives, clock)
             driver.configure(config.period, config.limits.slider.fastest)
             ticker = Ticker(round(config.period * 1e9))
             tick = simulated.tick if clock is simulated else lambda: ticker.wait().missed

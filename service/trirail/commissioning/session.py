@@ -70,8 +70,8 @@ class Session:
             return Judgement("ok", words), {}
         fastest = self._config.limits.slider.fastest
         timing = self._config.period, time.monotonic, fastest
-        bus, io, bitrate = self.environment.bus, self._config.drive_io, self._config.can.bitrate
-        self._inspected = inspect(bus, drives, *timing, apply=False, io=io, bitrate=bitrate)
+        bus, io, timing_of_bus = self.environment.bus, self._config.drive_io, self._config.can.timing
+        self._inspected = inspect(bus, drives, *timing, apply=False, io=io, timing=timing_of_bus)
         lines = tuple(
             line
             for each in self._inspected

@@ -103,7 +103,7 @@ def rules(config: Config) -> Iterator[Rule]:
     yield from settings_checks.io_rules(config.drives.protocol, named_io(config.outputs, config.inputs))
     yield from digital_rules(config.outputs, config.inputs)
     yield Rule("loop.rate_hz", (), partial(_check_rate, config))
-    yield from settings_checks.bus_rules(config.can)
+    yield from settings_checks.bus_rules(config.can, config.drives.protocol)
     yield from settings_checks.rules(config.drives, _required(config))
 
 

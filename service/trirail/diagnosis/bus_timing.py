@@ -16,9 +16,10 @@ from typing import Final, Literal
 
 import numpy as np
 from msgspec import Struct
-from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.loopback import Loopback, StampedFrame
 from trirail_drivers.interface import NAMES
+from trirail_drivers.timing import BusTiming
 
 from trirail.config import LoopTable
 from trirail.diagnosis.bare_loop import BareBus, compute_percentiles, prepare
@@ -47,7 +48,7 @@ which CANSimple does not define. These identifiers are last in arbitration, and 
 Source = Literal["service", "test frames"]
 
 
-class BusTiming(Struct, frozen=True):
+class MeasuredTiming(Struct, frozen=True):
     """Times of cycles on the bus, in a form for programs; times are in microseconds."""
 
     source: Source
@@ -67,7 +68,7 @@ class BusTiming(Struct, frozen=True):
 
 def compute_timing(
     runs: Sequence[Sequence[StampedFrame]], source: Source, sync: int, setpoints: Container[int]
-) -> BusTiming | None:
+) -> MeasuredTiming | None:
     """Compute the timing from the frames that this machine has sent; return None without two SYNCs in a row.
 
     Parameters
@@ -98,7 +99,7 @@ def compute_timing(
             if times:
                 last.append(max(times) - cycle[0].t)
             lacking += not expected <= {frame.identifier for frame in cycle[1:]}
-    return BusTiming(
+    return MeasuredTiming(
         source=source,
         timestamps="hardware" if all(frame.is_hardware for run in sent for frame in run) else "software",
         rate_hz=rate_hz,
@@ -111,19 +112,21 @@ def compute_timing(
 
 def measure(
     channel: str,
-    bitrate: int,
+    bus: BusTiming,
     loop: LoopTable,
     sync: int | None,
     setpoints: Container[int],
     unfit: str = "",
     progress: Callable[[float], None] | None = None,
-) -> BusTiming | str:
+) -> MeasuredTiming | str:
     """Measure the timing on an interface; return the reason if that is not possible.
 
     A running service is listened to. On an idle bus, test frames are sent at the loop's rate.
 
     Parameters
     ----------
+    bus
+        Bit rates of the interface.
     sync
         Identifier of SYNC, or None if the protocol has none.
     setpoints
@@ -141,29 +144,29 @@ def measure(
                 heard += loopback.listen(LISTENING_S - WAITING_S)
                 timing = compute_timing([heard], "service", sync, setpoints)
                 return timing if timing is not None else "only one SYNC was sent in the time of the measurement"
-            if reason := unfit or _why_not_idle(heard, bitrate, sync):
+            if reason := unfit or _why_not_idle(heard, bus, sync):
                 return reason
-            return _send_test_frames(channel, bitrate, loop, loopback, progress)
+            return _send_test_frames(channel, bus, loop, loopback, progress)
     except OSError as error:
         return f"{error.strerror or error}"
 
 
-def _why_not_idle(heard: Sequence[StampedFrame], bitrate: int, sync: int | None) -> str:
+def _why_not_idle(heard: Sequence[StampedFrame], bus: BusTiming, sync: int | None) -> str:
     """Return why test frames must not be sent after these frames arrived within WAITING_S, or ""."""
     if sync is not None and any(_is_sync(frame, sync) for frame in heard):
         return "another node sends SYNC, so no test frames were sent"
-    load = sum(frame_bits(len(frame.data)) for frame in heard) / WAITING_S / bitrate
+    load = sum(bus.frame_ns(len(frame.data)) for frame in heard) * 1e-9 / WAITING_S
     if load > MAX_IDLE_LOAD:
         return f"other nodes use {load:.1%} of the bus, so no test frames were sent"
     return ""
 
 
 def _send_test_frames(
-    channel: str, bitrate: int, loop: LoopTable, loopback: Loopback, progress: Callable[[float], None] | None
-) -> BusTiming | str:
+    channel: str, bus: BusTiming, loop: LoopTable, loopback: Loopback, progress: Callable[[float], None] | None
+) -> MeasuredTiming | str:
     """Run bare cycles with test frames on an idle bus."""
     sync, setpoints = Frame(TEST_FRAMES[0]), [Frame(each, bytes(8)) for each in TEST_FRAMES]
-    share = loop.rate_hz * (sync.bits + sum(frame.bits for frame in setpoints)) / bitrate
+    share = loop.rate_hz * sum(bus.frame_ns(frame.length) for frame in (sync, *setpoints)) * 1e-9
     if share > 1.0:
         return f"test frames at {loop.rate_hz} Hz would need {share:.0%} of the bus"
     prepare()
@@ -174,11 +177,11 @@ def _send_test_frames(
         carrier.send(sync.packed)
         if not _await_frame(loopback):
             return f"no node acknowledged a test frame within {SENT_WITHIN_S:g} s; switch on the drives' supply"
-        bus = BareBus(carrier.fileno(), sync, setpoints)
+        bare = BareBus(carrier.fileno(), sync, setpoints)
         batches = max(1, round(SENDING_S * loop.rate_hz / BATCH_CYCLES))
         unused, runs = np.zeros(BATCH_CYCLES, np.int64), []
         for number in range(batches):
-            bus.exchange(1_000_000_000 // loop.rate_hz, unused, unused.copy())
+            bare.exchange(1_000_000_000 // loop.rate_hz, unused, unused.copy())
             runs.append(list(loopback.listen(1.0 / loop.rate_hz)))
             if progress is not None:
                 progress((number + 1) / batches)

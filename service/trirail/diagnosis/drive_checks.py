@@ -8,6 +8,7 @@ from statistics import median
 
 from msgspec import Struct
 from trirail_drivers.bus.load import HIGH_LOAD, TrafficPlan, usage
+from trirail_drivers.config import Can
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
@@ -19,6 +20,7 @@ MAX_SCALE_RATIO = 8.0
 """Greatest plausible ratio between the scales of two drives of one robot."""
 _NUMBERS = ("counts_per_metre", "revolutions_per_metre")
 _UNITS = ("velocity_unit", "acceleration_unit")
+_BUS = ("can.bitrate", "can.fd", "can.data_bitrate")
 
 
 def _alike(config: Config) -> Iterator[Check]:
@@ -122,7 +124,7 @@ class BusUse(Struct, frozen=True):
 def plan_traffic(config: Config) -> TrafficPlan:
     """Return the frames that a configuration puts on the bus if the drives have every optional object."""
     protocol = PROTOCOLS[config.drives.protocol]
-    return protocol.plan_traffic(config.drives, config.drive_io, config.loop.rate_hz, config.can.bitrate)
+    return protocol.plan_traffic(config.drives, config.drive_io, config.loop.rate_hz, config.can.timing)
 
 
 def bus_use(config: Config) -> BusUse:
@@ -132,7 +134,7 @@ def bus_use(config: Config) -> BusUse:
         channel=can.channel,
         bitrate=can.bitrate,
         rate_hz=rate,
-        load=plan.traffic.bus_load(rate, can.bitrate, config.drives.heartbeat),
+        load=plan.traffic.bus_load(rate, can.timing, config.drives.heartbeat),
         budget_us=setpoint_budget_us(config),
         setpoint_bytes=plan.setpoint_bytes,
         velocity_offset=plan.velocity_offset,
@@ -150,27 +152,32 @@ def usage_of(config: Config, load: float) -> str:
 
 def setpoint_budget_us(config: Config) -> float:
     """Return the part of the cycle that the bus leaves to the loop [µs], as in trirail.wire.state.LoopState."""
-    share = plan_traffic(config).traffic.bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat)
+    share = plan_traffic(config).traffic.bus_load(config.loop.rate_hz, config.can.timing, config.drives.heartbeat)
     return max(0.0, 1.0 - share) * config.period * 1e6
+
+
+def _faster(section: Can) -> str:
+    """Return the setting of the bus that lets its frames take less time."""
+    return "a higher data_bitrate" if section.fd else "a higher bitrate"
 
 
 def load(config: Config) -> Iterator[Check]:
     """Check the fraction of the bus capacity that the cycle uses in the worst case."""
-    rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
+    rate, timing, drives = config.loop.rate_hz, config.can.timing, config.drives
     plan = plan_traffic(config)
     frames = plan.traffic
-    share = frames.bus_load(rate, bitrate, drives.heartbeat)
+    share = frames.bus_load(rate, timing, drives.heartbeat)
     left = f"{setpoint_budget_us(config):.0f} µs of each cycle are left to the loop" if share < 1.0 else ""
-    finding = f"{usage_of(config, share)} at {bitrate} bit/s"
+    finding = f"{usage_of(config, share)} at {timing}"
     finding = "; ".join(filter(None, (": ".join(filter(None, (finding, plan.omission))), left)))
     if share > HIGH_LOAD:
-        highest = HIGH_LOAD * frames.highest_rate(bitrate, drives.heartbeat)
-        remedy = f"set loop.rate_hz below {highest:.0f}, or a higher bitrate"
+        highest = HIGH_LOAD * frames.highest_rate(timing, drives.heartbeat)
+        remedy = f"set loop.rate_hz below {highest:.0f}, or {_faster(config.can)}"
         remedy = "; or ".join(filter(None, (remedy, plan.remedy)))
         yield Check("bus load", "failure" if share > 1.0 else "warning", finding, remedy, "loop.rate_hz")
     elif plan.full_load is not None:
         # The load minus the background is proportional to the rate.
-        background = frames.background(drives.heartbeat) / bitrate
+        background = frames.background(timing, drives.heartbeat)
         highest = rate * (HIGH_LOAD - background) / (plan.full_load - background)
         remedy = (
             f"the drives follow with more lag; for the velocity offset, set loop.rate_hz below {highest:.0f}; "
@@ -190,5 +197,5 @@ CONFIG_CHECKS = (
     ConfigCheck((*_each("offset", "homing"), "limits.slider", "drives.quick_stop_deceleration", "geometry"), _zero),
     ConfigCheck(("drives.protocol", *_each("accept_without")), protections),
     ConfigCheck(("limits.slider.following_error", "drives.following_error"), windows),
-    ConfigCheck(("loop.rate_hz", "can.bitrate", "drives.protocol", "drives.heartbeat", "drives.velocity_offset"), load),
+    ConfigCheck(("loop.rate_hz", *_BUS, "drives.protocol", "drives.heartbeat", "drives.velocity_offset"), load),
 )

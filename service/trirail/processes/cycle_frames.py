@@ -2,8 +2,9 @@
 
 They send and receive frames, recognise expected frames and encode setpoints. The functions do not depend on any drive
 protocol. They use only the tables of trirail_drivers.driver.cyclic, which each driver fills: `axes` (3,) of AXIS,
-`expected` (n,) of EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. Frames are sent and
-received by libc on the socket of the bus. If the bus has no socket, Python functions send and receive the frames.
+`expected` (n,) of EXPECTED, `times` (1,) of TIMES, and frames (n, 72) as `struct can_frame` or `struct canfd_frame`.
+Frames are sent and received by libc on the socket of the bus. If the bus has no socket, Python functions send and
+receive the frames.
 """
 
 from __future__ import annotations
@@ -16,8 +17,7 @@ from llvmlite import ir
 from numba import f8, from_dtype, i4, i8, types, u1, u8
 from numba.extending import intrinsic
 from numpy.typing import NDArray
-from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT
-from trirail_drivers.bus.frames import BITS
+from trirail_drivers.bus.can_frame import DATA_AT, FRAME_SIZES, LENGTH_AT
 from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET
 from trirail_drivers.driver.cyclic import EXPECTED, MOST_FRAMES, TIMES
 from trirail_drivers.driver.scaling import INT32_MAX
@@ -28,8 +28,6 @@ from trirail.processes.clock import now_ns, sleep
 
 AXES, EXPECTATIONS, TIMINGS = from_dtype(AXIS)[::1], from_dtype(EXPECTED)[::1], from_dtype(TIMES)[::1]
 FRAMES = u1[:, ::1]
-LENGTH_AT = 4
-"""Offset of the data length in a frame."""
 
 
 # Functions of libc, resolved by name: sys/socket.h, errno.h, string.h.
@@ -44,7 +42,7 @@ _PERSISTENT_ERROR: Final = -1
 """Error that the next call would return again. The other end has disconnected, or Python has stored an exception."""
 _FLAGS: Final = 0x40 | 0x4000
 """MSG_DONTWAIT and MSG_NOSIGNAL of sys/socket.h."""
-_FRAME: Final = CAN_FRAME.size
+_FRAME, _FD_FRAME = FRAME_SIZES
 
 
 def _call(_typing: Any, _address: Any, _frames: Any, _number: Any) -> Any:
@@ -94,7 +92,8 @@ def receive_frames(
         memcpy(scratch.ctypes.data, _errno(), np.uint64(4))
         return 0, (scratch[0] if scratch[0] != _NOTHING_THERE else 0)
     for i in range(number):
-        if headers[i, 7] & np.uint64(0xFFFFFFFF) != np.uint64(_FRAME):
+        size = headers[i, 7] & np.uint64(0xFFFFFFFF)
+        if size != np.uint64(_FRAME) and size != np.uint64(_FD_FRAME):
             return i, _PERSISTENT_ERROR
     return number, 0
 
@@ -103,7 +102,7 @@ def receive_frames(
 def send_frames(
     bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], times: NDArray[np.void]
 ) -> int:
-    """Send the frames of a PackedFrames, and count the bits of the accepted frames as traffic.
+    """Send the frames of a PackedFrames, and count the duration of the accepted frames as traffic.
 
     Return the number of frames that were accepted before the first refused frame.
     """
@@ -114,7 +113,7 @@ def send_frames(
     else:
         number = int(max(_sendmmsg(bus[0], headers.ctypes.data, np.uint32(len(headers)), _FLAGS), 0))
     for i in range(number):
-        times[0].traffic += BITS[frames[i, LENGTH_AT]]
+        times[0].traffic += times[0].frame_ns[frames[i, LENGTH_AT]]
     return number
 
 
@@ -190,7 +189,7 @@ def process_frames(
 
     Parameters
     ----------
-    frames : (n, 16)
+    frames : (n, 72)
         Frames, of which the first `number` have been received.
     now : float
         Time of reception [s].
@@ -222,7 +221,7 @@ def process_frames(
             axis.status_heard = now
         if row.lives:
             axis.heard = now
-        times[0].traffic += BITS[length]
+        times[0].traffic += times[0].frame_ns[length]
     return number
 
 

@@ -81,7 +81,7 @@ class _Rehearsal:
         self._clock = _RehearsedTime()
         self._bus = simulated_bus(config.can, config.drives, self._clock)
         driver = PROTOCOLS[config.drives.protocol].driver
-        self._drives = driver(self._bus, config.can.bitrate, config.drives, self._clock, None, config.drive_io)
+        self._drives = driver(self._bus, config.can.timing, config.drives, self._clock, None, config.drive_io)
         listening = [links.listen(folder / name) for name in Ports._fields]
         gateway, recorder, planner = listening
         self._ports = Ports(Port(gateway), Port(recorder), Port(planner))

@@ -262,7 +262,7 @@ def _receive(s: Any, moment: NDArray[np.int64], frames: Exchange, t: float) -> b
 
 @compiled()
 def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours, frames: Exchange) -> int:
-    """Wait for the tick, and send the frames at the start of a cycle. Return CONTINUE, or the stage that was reached."""
+    """Wait for the tick, and send the frames at the start of a cycle. Return CONTINUE, or the reached stage."""
     s, times = state[0], frames.times
     s.deadline_ns += s.period_ns
     if _wait(state, moment, neighbours.pollfds):

@@ -70,9 +70,8 @@ class Reports:
         self._period = config.period
         self._welcome = Welcome(lacking, drives.bus_load, drives.missing_protections)
         self._status = Status(None, 1.0, None)
-        self._bitrate = config.can.bitrate
         self._bus_load = 0.0
-        self._bits = drives.traffic
+        self._traffic = drives.traffic
         self._bus_measured_at = self._progress_at = 0
         self._unready: UnreadyDrives = (None, None, None)
         self._events = 0
@@ -195,8 +194,8 @@ class Reports:
         """Calculate and report the fraction of the bus capacity that is in use, once per second."""
         cycles = self._control.cycles - self._bus_measured_at
         if cycles * self._period >= 1.0:
-            bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
-            self._bus_load = round(bits / (cycles * self._period * self._bitrate), 3)
+            busy_ns, self._traffic = self._drives.traffic - self._traffic, self._drives.traffic
+            self._bus_load = round(busy_ns * 1e-9 / (cycles * self._period), 3)
             self._bus_measured_at += cycles
             self._publish_status()
 

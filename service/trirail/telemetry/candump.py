@@ -9,7 +9,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
+from trirail_drivers.bus.can_frame import (
+    BIT_RATE_SWITCH,
+    CAPTURED,
+    DATA_AT,
+    ERROR,
+    ERROR_STATE,
+    EXTENDED,
+    EXTENDED_BITS,
+    FD_FLAGS_AT,
+    FD_FORMAT,
+    HEADER,
+    REMOTE,
+    STANDARD_BITS,
+)
 
 from trirail.telemetry.sinks import RESERVE, disk_shortage, identity
 from trirail.wire.event_codes import EventCode, EventText, coded
@@ -81,15 +94,19 @@ class CandumpLog:
 
 
 def _format_frame(frame: bytes) -> str:
-    """Format a `struct can_frame` as candump does.
+    """Format the first bytes of a `struct can_frame` or `struct canfd_frame` as candump does.
 
     An 11-bit identifier has 3 digits; a longer identifier and that of an error frame have 8 digits.
     """
-    identifier, length, data = CAN_FRAME.unpack(frame)
+    identifier, length = HEADER.unpack_from(frame)
+    flags, data = frame[FD_FLAGS_AT], frame[DATA_AT:]
     if identifier & ERROR:
         name = f"{identifier & (ERROR | EXTENDED_BITS):08X}"
     elif identifier & EXTENDED:
         name = f"{identifier & EXTENDED_BITS:08X}"
     else:
         name = f"{identifier & STANDARD_BITS:03X}"
-    return f"{name}#{'R' if identifier & REMOTE else data[:length].hex().upper()}"
+    content = data[:length].hex().upper()
+    if flags & FD_FORMAT:
+        return f"{name}##{flags & (BIT_RATE_SWITCH | ERROR_STATE):X}{content}"
+    return f"{name}#{'R' if identifier & REMOTE else content}"
