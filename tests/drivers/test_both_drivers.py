@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from rigs import ENABLED, OFF, STANDSTILL, START, STEP, DriverRig
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
+from trirail_drivers.timing import BusTiming
 
 from drivers import test_cia402, test_odrive
 
@@ -42,7 +43,7 @@ def test_a_missing_drive_is_named(new: AnyRig) -> None:
 @pytest.mark.parametrize("bitrate", [500_000, 1_000])
 def test_full_bus_is_refused_with_the_rate_that_fits(new: AnyRig, bitrate: int) -> None:
     with pytest.raises(BusError, match=r"1000 Hz takes .*%.* the highest rate that fits is \d+ Hz"):
-        type(new.drives)(new.bus, bitrate, new.config, new.clock).configure(STEP)
+        type(new.drives)(new.bus, BusTiming(bitrate), new.config, new.clock).configure(STEP)
 
 
 def test_a_drive_in_fault_is_set_up_all_the_same(new: AnyRig) -> None:

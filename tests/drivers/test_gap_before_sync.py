@@ -8,6 +8,7 @@ import pytest
 from drivers.test_cia402 import PERIOD, Rig
 from rigs import OFF, frame
 from trirail_drivers.cia402 import canopen_frames as layout
+from trirail_drivers.driver.driver import MAX_STEPS_LEFT_OUT
 from trirail_drivers.interface import PowerState
 from trirail_drivers.timing import frame_bits
 
@@ -66,3 +67,16 @@ def test_a_reset_before_a_sync_starts_the_nodes_and_clears_the_faults_in_the_nex
     assert layout.NMT in after
     enabled.cycles(300)
     assert enabled.enable().state == (PowerState.OPERATION_ENABLED,) * 3
+
+
+def test_a_recovery_continues_even_if_every_cycle_is_late(enabled: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[float] = []
+    assert enabled.drives._recovery is not None
+    monkeypatch.setattr(enabled.drives._recovery, "step", lambda now, stopping: steps.append(now))
+    for cycle in range(3 * (MAX_STEPS_LEFT_OUT + 1)):
+        enabled.drives._synced = enabled.clock() - PERIOD
+        enabled.drives._recover()
+        assert len(steps) == (cycle + 1) // (MAX_STEPS_LEFT_OUT + 1)
+    enabled.drives._synced = enabled.clock()
+    enabled.drives._recover()
+    assert len(steps) == 4

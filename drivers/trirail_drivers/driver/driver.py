@@ -25,6 +25,8 @@ from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtectio
 from trirail_drivers.timing import BusTiming
 
 Result = TypeVar("Result")
+MAX_STEPS_LEFT_OUT = 10
+"""Maximum number of consecutive late cycles in which a recovery waits, so that drives also return to a slow machine."""
 
 
 class Driver(ABC, Generic[AnyAxis]):
@@ -61,6 +63,8 @@ class Driver(ABC, Generic[AnyAxis]):
         for each, digital in zip(self._axes, io, strict=True):
             each.assign_io(digital)
         self._recovery: Recovery[AnyAxis, Any, Any] | None = None
+        self._steps_left_out = 0
+        """Number of consecutive late cycles in which the recovery has not continued."""
         self._period = 0.0
         self.next_sync = math.inf
         self._synced = 0.0
@@ -121,8 +125,11 @@ class Driver(ABC, Generic[AnyAxis]):
         if self._recovery is None:
             return
         # In a late cycle, a request would delay the next SYNC. The setpoints before it may still be in the queue.
-        if self._clock() + self._duration(len(self._axes) + 1) > self._synced + self._period:
+        late = self._clock() + self._duration(len(self._axes) + 1) > self._synced + self._period
+        if late and self._steps_left_out < MAX_STEPS_LEFT_OUT:
+            self._steps_left_out += 1
             return
+        self._steps_left_out = 0
         if self._wire.carries:
             self._recovery.step(self._synced, stopping=self._off_deadline != math.inf)
         else:
