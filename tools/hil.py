@@ -5,8 +5,8 @@ make hil                          the same, and installs missing packages if pos
 
 In the machine, tools/hil_guest.py runs the service on can0, virtual drives on can1, and a client. Then it runs a second
 service on vcan0 at another rate, with one drive that is homed and one third-party drive. Then pytest runs the tests
-marked vcan. Outside the machine, tools/bus_log.py and Wireshark's dissector check the frames on both buses. `--only fd`
-runs tools/hil_fd.py instead: a service at 2 kHz on vcan1 as a CAN FD bus.
+marked vcan. tools/hil_fd.py runs a service on vcan1 as a CAN FD bus. `--only` selects one of these. Outside the machine,
+tools/bus_log.py and Wireshark's dissector check the frames.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import hil_fd
 import hil_programs
 import hil_second
 from hil_dissector import Dissected
-from hil_machine import DEFAULT_STEPS, ROOT, STEPS, compiling, machine, output_lines, pack
+from hil_machine import ROOT, STEPS, compiling, machine, output_lines, pack
 from hil_needs import Failed, install, last, requirements
 from trirail.config import Config, load
 
@@ -73,7 +73,7 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, _interrupt)
     say = Progress(sys.stderr if options.json else sys.stdout)
-    steps = DEFAULT_STEPS if options.only is None else (options.only,)
+    steps = STEPS if options.only is None else (options.only,)
     report: dict[str, Any] = {"ok": False, "checks": {}, "failure": None, "not_shown": NOT_SHOWN}
     folder: Path | None = None
     try:
@@ -149,7 +149,7 @@ def run(
             raise Failed(f"{failed}{_logs(folder, 'fd-service', 'fd-drives')}") from None
         report["checks"]["fd"] = hil_fd.HELD
         loop = report["fd"]["loop"]
-        say(f"CAN FD: {hil_fd.HELD}; {loop['overruns']} ticks missed, {loop['cycles']} cycles of {hil_fd.RATE_HZ} Hz")
+        say(f"CAN FD: {hil_fd.HELD}; {loop['overruns']} ticks missed, {loop['cycles']} cycles")
         say(f"CAN FD: {json.dumps(report['fd'])}")
     if "tests" in steps:
         _judge_tests(folder, say, report)

@@ -30,11 +30,6 @@ TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py", "te
 STEPS = "robots", "fd", "tests"
 """Steps in the machine: two robots on classical CAN, a robot on CAN FD, and the tests marked vcan."""
 
-DEFAULT_STEPS = "robots", "tests"
-"""Steps without the robot on CAN FD: at 2 kHz, simulated drives need a processor that is not emulated, otherwise they
-answer too late and the service reports them as lost.
-"""
-
 COMPILED = "compiled"
 """Name of the file with the outcome of compiling. The machine waits for this file."""
 CACHE = Path(sys.prefix) / "hil-numba"
@@ -117,7 +112,7 @@ def can_interface(name: str) -> str:
     return "\n".join([setting, *(f"{line[1:]} || true" if line.startswith("-") else line for line in commands)])
 
 
-def script(folder: Path, packed: tuple[Path, ...], steps: Collection[str] = DEFAULT_STEPS) -> str:
+def script(folder: Path, packed: tuple[Path, ...], steps: Collection[str] = STEPS) -> str:
     """Return the shell script that the machine runs as root, with some of its STEPS."""
     commands = {
         "robots": f"{sys.executable} tools/hil_guest.py {folder}",
@@ -164,7 +159,7 @@ set +e
 
 @contextlib.contextmanager
 def machine(
-    folder: Path, kernel: Path, packed: tuple[Path, ...], steps: Collection[str] = DEFAULT_STEPS
+    folder: Path, kernel: Path, packed: tuple[Path, ...], steps: Collection[str] = STEPS
 ) -> Iterator[queue.Queue[str | None]]:
     """Boot the machine; yield the queue of the lines that it prints, which ends with None.
 
