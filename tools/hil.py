@@ -5,8 +5,8 @@ make hil                          the same, and installs missing packages if pos
 
 In the machine, tools/hil_guest.py runs the service on can0, virtual drives on can1, and a client. Then it runs a second
 service on vcan0 at another rate, with one drive that is homed and one third-party drive. Then pytest runs the tests
-marked vcan. tools/hil_fd.py runs a service on vcan1 as a CAN FD bus. `--only` selects one of these. Outside the machine,
-tools/bus_log.py and Wireshark's dissector check the frames.
+marked vcan. tools/hil_fd.py runs a service on vcan1 as a CAN FD bus. `--only` selects one of these. Outside the
+machine, tools/bus_log.py and Wireshark's dissector check the frames.
 """
 
 from __future__ import annotations
