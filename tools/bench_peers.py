@@ -1,9 +1,11 @@
 """Intervals of SYNC at the drives: trirail's loop, python-canopen's SYNC, LinuxCNC's servo thread, and the machine.
 
 trirail and python-canopen send over the same bus between processes to the same drives, which note when each SYNC
-arrives. python-canopen runs unchanged, with the loop's privileges, and with setpoints. LinuxCNC's servo thread drives
-no drives, so its intervals are those of its own clock. The machine's own lateness is measured before and after them,
-with the same priority on the same processor.
+arrives. An arrival includes the wake-up of the drives' process, which a CAN controller does not need. A bare compiled
+loop, which only sends SYNC and setpoints, shows how much of the deviation that is: no sender can be better here.
+python-canopen runs unchanged, with the loop's privileges, and with setpoints. LinuxCNC's servo thread drives no drives,
+so its intervals are those of its own clock. The machine's own lateness is measured before and after them, with the same
+priority on the same processor.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ import bench_linuxcnc
 import numpy as np
 from bench_beside import Beside
 from bench_rig import QUANTILES, configured, drives, quantiles, rig, without_pause
+from trirail.diagnosis.bare_loop import BareBus, prepare
 from trirail.processes.clock import Ticker
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import canopen_frames as layout
 
@@ -39,9 +43,10 @@ def measure(seconds: float) -> dict[str, Any]:
     before = _machine(seconds)
     deviations = {
         "trirail, moving": _trirail(seconds),
-        "python-canopen": _canopen(seconds, "its own thread"),
-        "python-canopen, SCHED_FIFO": _canopen(seconds, "real time"),
-        "python-canopen, SCHED_FIFO, with setpoints": _canopen(seconds, "setpoints"),
+        "a bare compiled loop": _sent(seconds, "bare"),
+        "python-canopen": _sent(seconds, "its own thread"),
+        "python-canopen, SCHED_FIFO": _sent(seconds, "real time"),
+        "python-canopen, SCHED_FIFO, with setpoints": _sent(seconds, "setpoints"),
     }
     linuxcnc = _linuxcnc(seconds)
     if not isinstance(linuxcnc, str):
@@ -53,9 +58,14 @@ def measure(seconds: float) -> dict[str, Any]:
         "quantiles": QUANTILES,
         "deviation_us": deviations,
         "machine_us": {"before": before, "after": after},
-        "ratio": [ours / own for ours, own in zip(deviations["trirail, moving"], machine, strict=True)],
+        "ratio": _ratios(deviations["trirail, moving"], machine),
+        "ratio_to_bare": _ratios(deviations["trirail, moving"], deviations["a bare compiled loop"]),
         "linuxcnc": linuxcnc if isinstance(linuxcnc, str) else "",
     }
+
+
+def _ratios(ours: list[float], others: list[float]) -> list[float]:
+    return [our / other for our, other in zip(ours, others, strict=True)]
 
 
 def _machine(seconds: float) -> list[float]:
@@ -76,7 +86,8 @@ def _trirail(seconds: float) -> list[float]:
         return _deviations([each for each in _arrivals(times) if began < each < ended])
 
 
-def _canopen(seconds: float, way: str) -> list[float]:
+def _sent(seconds: float, way: str) -> list[float]:
+    """Return the deviations of SYNCs that a program without a robot sends; see `_send_sync`."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
         config, _ = configured(Path(folder), RATE, own=False)
         path, times = f"{folder}/can", Path(folder, "syncs")
@@ -110,18 +121,24 @@ def _linuxcnc(seconds: float) -> list[float] | str:
 
 
 def _send_sync(path: str, seconds: float, way: str) -> None:
-    """Send SYNC by python-canopen on the bus for `seconds`.
+    """Send SYNC on the bus for `seconds`.
 
-    `way` is "its own thread" for the library's periodic SYNC; "real time" for the same with the loop's priority; or
-    "setpoints" for SYNC and three setpoints from a loop with that priority, which sleeps to absolute deadlines.
+    `way` is "its own thread" for python-canopen's periodic SYNC; "real time" for the same with the loop's priority; or
+    "setpoints" for SYNC and three setpoints from a loop with that priority, which sleeps to absolute deadlines. "bare"
+    is that loop in compiled code, without python-canopen.
     """
     import canopen
 
+    if way == "bare":
+        prepare()
     if way != "its own thread":
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     with UnixBus(path) as bus:
+        if way == "bare":
+            _run_bare(bus, seconds)
+            return
         network = canopen.Network(bus)
         if way == "setpoints":
             setpoint, ticker, end = (
@@ -138,6 +155,15 @@ def _send_sync(path: str, seconds: float, way: str) -> None:
             network.sync.start(1.0 / RATE)
             time.sleep(seconds)
             network.sync.stop()  # type: ignore[no-untyped-call]
+
+
+def _run_bare(bus: UnixBus, seconds: float) -> None:
+    """Send SYNC and three setpoints in the compiled loop of trirail.diagnosis.bare_loop."""
+    if bus.carrier is None:
+        raise SystemExit("the drives have closed the bus")
+    setpoints = [Frame(layout.RPDO2 + node, bytes(8)) for node in NODES]
+    unused = np.zeros(max(1, round(seconds * RATE)), np.int64)
+    BareBus(bus.carrier.fileno(), Frame(layout.SYNC), setpoints).exchange(1_000_000_000 // RATE, unused, unused.copy())
 
 
 if __name__ == "__main__":
