@@ -60,9 +60,9 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
         )
     with open_bus(settings.can, settings.drives) as bus:
         fastest = settings.limits.slider.fastest
-        timing = settings.period, time.monotonic, fastest
-        io, bitrate = settings.drive_io, settings.can.bitrate
-        reports = inspect(bus, settings.drives, *timing, apply=apply, io=io, bitrate=bitrate)
+        cycle = settings.period, time.monotonic, fastest
+        io, timing = settings.drive_io, settings.can.timing
+        reports = inspect(bus, settings.drives, *cycle, apply=apply, io=io, timing=timing)
     fit = not any(each["refused"] for each in reports)
     if json:
         terminal.json({"ok": fit, "applied": apply, "drives": reports})

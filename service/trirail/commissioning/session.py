@@ -69,9 +69,9 @@ class Session:
             words = (f"drives of protocol {drives.protocol} have no objects to inspect; the next step finds them",)
             return Judgement("ok", words), {}
         fastest = self._config.limits.slider.fastest
-        timing = self._config.period, time.monotonic, fastest
-        bus, io, timing_of_bus = self.environment.bus, self._config.drive_io, self._config.can.timing
-        self._inspected = inspect(bus, drives, *timing, apply=False, io=io, timing=timing_of_bus)
+        cycle = self._config.period, time.monotonic, fastest
+        bus, io, timing = self.environment.bus, self._config.drive_io, self._config.can.timing
+        self._inspected = inspect(bus, drives, *cycle, apply=False, io=io, timing=timing)
         lines = tuple(
             line
             for each in self._inspected

@@ -129,7 +129,7 @@ STATE = np.dtype(
 _STATE = from_dtype(STATE)[::1]
 
 
-class Exchange(NamedTuple):
+class FrameTables(NamedTuple):
     """Tables of the frames that a cycle exchanges with the drives, as in trirail_drivers.driver.cyclic.Cyclic."""
 
     bus: NDArray[np.int64]
@@ -211,8 +211,8 @@ def _typed(kind: type, *members: Any) -> Any:
 
 
 _HEADERS = u8[:, ::1]
-_EXCHANGE = _typed(
-    Exchange,
+_FRAME_TABLES = _typed(
+    FrameTables,
     *(i8[::1], FRAMES, _HEADERS, FRAMES, _HEADERS, FRAMES, _HEADERS, FRAMES, _HEADERS, FRAMES, _HEADERS),
     *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1]),
 )
@@ -253,7 +253,7 @@ def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None
 
 
 @compiled()
-def _receive(s: Any, moment: NDArray[np.int64], frames: Exchange, t: float) -> bool:
+def _receive(s: Any, moment: NDArray[np.int64], frames: FrameTables, t: float) -> bool:
     """Receive and process frames. Return True if there was no error, all frames were expected and no frame is left."""
     s.arrived, s.error = receive_frames(frames.bus, frames.arrivals, frames.arrived, moment)
     s.handled = process_frames(frames.arrived, s.arrived, frames.expected, frames.axes, frames.times, t)
@@ -261,7 +261,7 @@ def _receive(s: Any, moment: NDArray[np.int64], frames: Exchange, t: float) -> b
 
 
 @compiled()
-def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours, frames: Exchange) -> int:
+def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours, frames: FrameTables) -> int:
     """Wait for the tick, and send the frames at the start of a cycle. Return CONTINUE, or the reached stage."""
     s, times = state[0], frames.times
     s.deadline_ns += s.period_ns
@@ -300,7 +300,7 @@ def _read(
     state: NDArray[np.void],
     moment: NDArray[np.int64],
     neighbours: Neighbours,
-    frames: Exchange,
+    frames: FrameTables,
     feedback: NDArray[np.void],
 ) -> int:
     """Read the drives' answers into `feedback`. Return CONTINUE, or the reached stage if Python must do it."""
@@ -328,7 +328,7 @@ def _read(
 
 @compiled()
 def _solve(
-    state: NDArray[np.void], moment: NDArray[np.int64], frames: Exchange, robot: RobotArrays, motion: MotionArrays
+    state: NDArray[np.void], moment: NDArray[np.int64], frames: FrameTables, robot: RobotArrays, motion: MotionArrays
 ) -> int:
     """Evaluate the feedback, and write the next setpoints into their frames. Return CONTINUE, or the reached stage."""
     s = state[0]
@@ -406,12 +406,12 @@ def _record(s: Any, robot: RobotArrays, batch: NDArray[np.uint8]) -> None:
     s.batched += 1
 
 
-@compiled(i8(_STATE, i8[::1], _NEIGHBOURS, _EXCHANGE, _ROBOT, _MOTION, _OUTPUTS), releases=True)
+@compiled(i8(_STATE, i8[::1], _NEIGHBOURS, _FRAME_TABLES, _ROBOT, _MOTION, _OUTPUTS), releases=True)
 def run(
     state: NDArray[np.void],
     moment: NDArray[np.int64],
     neighbours: Neighbours,
-    frames: Exchange,
+    frames: FrameTables,
     robot: RobotArrays,
     motion: MotionArrays,
     tables: OutputArrays,

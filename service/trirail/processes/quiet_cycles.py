@@ -192,7 +192,7 @@ class QuietCycles:
     def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
         """Return the arguments of the compiled function that stay the same while the drives lend their tables."""
         measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
-        frames = quiet.Exchange(
+        frames = quiet.FrameTables(
             bus=lent.bus,
             arrived=lent.arrived.frames,
             arrivals=lent.arrived.headers,
