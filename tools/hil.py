@@ -26,11 +26,11 @@ from typing import Any
 import bus_log
 import hil_dissector
 import hil_fd
-import hil_programs
 import hil_second
 from hil_dissector import Dissected
 from hil_machine import ROOT, STEPS, compiling, machine, output_lines, pack
-from hil_needs import Failed, install, last, requirements
+from hil_needs import install, last, requirements
+from hil_programs import Failed, changed
 from trirail.config import Config, load
 
 CHANGES = {
@@ -145,7 +145,7 @@ def run(
     if "fd" in steps:
         try:
             report["fd"] = hil_fd.check(folder, load(folder / "fd.toml"))
-        except hil_programs.Failed as failed:
+        except Failed as failed:
             raise Failed(f"{failed}{_logs(folder, 'fd-service', 'fd-drives')}") from None
         report["checks"]["fd"] = hil_fd.HELD
         loop = report["fd"]["loop"]
@@ -204,10 +204,7 @@ def configure(folder: Path) -> Config:
         # A stall of the host delays the drives as well as the loop, so it must not count as a loss of SYNC.
         "[drives]\n": "[can.simulated]\nmissed_syncs = 40\n\n[drives]\nsdo_timeout = 10.0\n",
     }
-    for before, after in changes.items():
-        if text.count(before) != 1:
-            raise Failed(f"configs/socketcan.toml: {before!r} is not there once; CHANGES of tools/hil.py needs it")
-        text = text.replace(before, after)
+    text = changed(text, changes)
     (folder / "robot.toml").write_text(text)
     (folder / "second.toml").write_text(hil_second.configure(text))
     (folder / "second.faults").write_text(hil_second.FAULTS)

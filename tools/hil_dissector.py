@@ -12,7 +12,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from hil_needs import SEARCH, Failed
+from hil_needs import SEARCH
+from hil_programs import Failed
 
 HELD = "Wireshark's dissector reads every frame; each SDO request is answered for its object; started nodes stay so"
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from hil_programs import STEP_TIMEOUT_S, Failed, Machine, wait_until
+from hil_programs import STEP_TIMEOUT_S, Failed, Machine, changed, wait_until
 
 if TYPE_CHECKING:
     from trirail.client.client import Robot
@@ -49,11 +49,7 @@ HELD = "every frame is a CAN FD frame with bit rate switch, and every setpoint i
 
 def configure(first: str) -> str:
     """Return the configuration of this robot, given that of the first robot. Raises Failed."""
-    for before, after in CHANGES.items():
-        if first.count(before) != 1:
-            raise Failed(f"{before!r} is not there once; CHANGES of tools/hil_fd.py needs it")
-        first = first.replace(before, after)
-    return first
+    return changed(first, CHANGES)
 
 
 def format_problems(log: Path, until: float) -> Iterator[str]:

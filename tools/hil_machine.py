@@ -14,7 +14,8 @@ import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from hil_needs import BIN, MODULES, SEARCH, Failed, busybox, last
+from hil_needs import BIN, MODULES, SEARCH, busybox, last
+from hil_programs import Failed
 
 ROOT = Path(__file__).parents[1]
 PRECEDENCE = "-10"

@@ -12,6 +12,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from hil_programs import Failed
+
 BIN = Path(sys.executable).parent
 SEARCH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 MODULES = (
@@ -35,10 +37,6 @@ PROGRAMS |= {"tshark": "tshark"}
 """Required programs, and the package of Debian and Ubuntu that contains each program."""
 KERNELS = {"debian": "linux-image-amd64", "ubuntu": "linux-image-generic"}
 """For each distribution, the package of a kernel with CAN and its drivers."""
-
-
-class Failed(Exception):
-    """A requirement is missing or a check has failed; the message contains the remedy or the log with details."""
 
 
 def lacking() -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -31,7 +31,16 @@ black box of each fault takes some seconds to write."""
 
 
 class Failed(Exception):
-    """A step or a check has failed."""
+    """A requirement is missing, or a step or a check has failed; the message contains the remedy or names the log."""
+
+
+def changed(text: str, changes: Mapping[str, str]) -> str:
+    """Replace parts of a configuration. Raises Failed unless each part occurs exactly once."""
+    for before, after in changes.items():
+        if text.count(before) != 1:
+            raise Failed(f"the configuration must contain {before!r} once, not {text.count(before)} times")
+        text = text.replace(before, after)
+    return text
 
 
 class Machine:

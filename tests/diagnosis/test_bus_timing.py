@@ -8,6 +8,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import carriers
@@ -197,6 +198,84 @@ def test_a_service_is_listened_to(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.source == "service"
     assert found.setpoints_us is not None
     assert found.setpoints_us.p50 == 300.0
+
+
+def test_frames_of_fewer_than_half_of_the_cycles_are_no_setpoints() -> None:
+    seldom = [frame(layout.RPDO2 + 9, 1000.0 * number + 500.0) for number in range(4)]
+    timing = compute_timing([cycles([0.0] * 10, [100.0] * 10) + seldom], "service", SYNC, SETPOINTS)
+    assert timing is not None
+    assert timing.without_setpoints == 0
+    assert timing.setpoints_us is not None
+    assert timing.setpoints_us.max == pytest.approx(100.0)
+
+
+class FakeCarrier:
+    """Socket of an interface whose other end the loopback hears."""
+
+    def __init__(self, heard: list[bytes]) -> None:
+        self._ours, self.other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.other.setblocking(False)
+        self.heard = heard
+
+    def __enter__(self) -> FakeCarrier:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ours.close()
+        self.other.close()
+
+    def setsockopt(self, *_: object) -> None:
+        pass
+
+    def bind(self, address: tuple[str]) -> None:
+        assert address == ("can0",)
+
+    def fileno(self) -> int:
+        return self._ours.fileno()
+
+    def send(self, packet: bytes) -> None:
+        self._ours.send(packet)
+
+    def listen(self, seconds: float) -> Iterator[StampedFrame]:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            try:
+                packet = self.other.recv(CAN_FRAME.size)
+            except BlockingIOError:
+                return
+            self.heard.append(packet)
+            identifier, length, data = CAN_FRAME.unpack(packet)
+            yield StampedFrame(identifier, data[:length], time.monotonic_ns(), True, False)
+
+
+@pytest.mark.parametrize("acknowledged", [True, False])
+def test_only_test_frames_are_sent_and_the_first_must_be_acknowledged(
+    acknowledged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard: list[bytes] = []
+    carrier = FakeCarrier(heard)
+    if not acknowledged:
+        monkeypatch.setattr(carrier, "listen", lambda _: iter(()))
+    names = {name: getattr(socket, name, 0) for name in ("AF_CAN", "SOCK_RAW", "CAN_RAW", "SOL_CAN_RAW")}
+    made = SimpleNamespace(**names, CAN_RAW_FILTER=1, socket=lambda *_: carrier)
+    monkeypatch.setattr(bus_timing, "socket", made)
+    monkeypatch.setattr(bus_timing, "SENDING_S", 1.0)
+    monkeypatch.setattr(bus_timing, "SENT_WITHIN_S", 0.05)
+    done: list[float] = []
+    found = bus_timing._send_test_frames("can0", DEFAULT_TIMING, LOOP, carrier, done.append)  # type: ignore[arg-type]
+    if not acknowledged:
+        assert isinstance(found, str)
+        assert found.startswith("no node acknowledged a test frame")
+        assert done == []
+        return
+    assert isinstance(found, MeasuredTiming)
+    batches = round(1.0 * LOOP.rate_hz / bus_timing.BATCH_CYCLES)
+    assert (found.source, found.syncs, done[-1]) == ("test frames", batches * bus_timing.BATCH_CYCLES, 1.0)
+    assert found.without_setpoints == 0
+    first, *others = (CAN_FRAME.unpack(packet)[:2] for packet in heard)
+    assert first == (TEST_FRAMES[0], 0)
+    cycle = [(TEST_FRAMES[0], 0), *((identifier, 8) for identifier in TEST_FRAMES)]
+    assert others == cycle * (batches * bus_timing.BATCH_CYCLES)
 
 
 @pytest.fixture

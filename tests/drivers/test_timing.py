@@ -157,3 +157,12 @@ def test_two_kilohertz_fit_on_can_fd_alone() -> None:
 def test_times_are_rounded_up() -> None:
     assert BusTiming(1_000_000).frame_ns(0) == 55_000
     assert BusTiming(7).frame_ns(0) == -(-55 * 10**9 // 7)
+
+
+@pytest.mark.parametrize("timing", [BusTiming(500_000), BusTiming(500_000, 2_000_000)], ids=["classical", "fd"])
+def test_a_total_bounds_the_sum_of_its_frames(timing: BusTiming) -> None:
+    lengths = (0, 1, 2, 4, 6, 8, 8)
+    exact = sum(map(timing.frame_ns, lengths)) * 1e-9
+    total = timing.total_seconds(len(lengths), sum(lengths))
+    assert exact - 1e-8 <= total <= exact + len(lengths) / timing.bitrate
+    assert timing.fd == (timing.data_bitrate is not None)

@@ -16,7 +16,7 @@ import hil_needs
 import hil_second
 import pytest
 from edsfiles import MAKES
-from hil_needs import Failed
+from hil_programs import Failed
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import load
