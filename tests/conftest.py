@@ -34,6 +34,9 @@ from trirail_drivers.simulated import SimulatedDrive
 _STATE = tempfile.TemporaryDirectory(prefix="trirail-tests-")
 os.environ["STATE_DIRECTORY"] = _STATE.name  # the poses that somebody has taught on this machine are no test's
 
+for _setting in ("TRIRAIL_ROBOT", "TRIRAIL_CONNECT", "TRIRAIL_TLS"):  # the tests start robots of their own
+    os.environ.pop(_setting, None)
+
 pytest_plugins = ["caused_messages", "generated", "parsed_eds", "warm"]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells have it for what runs in the background

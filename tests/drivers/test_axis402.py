@@ -9,6 +9,7 @@ import pytest
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Cia402Axis
 from trirail_drivers.config import Drive, Drives
+from trirail_drivers.driver.row_updates import count_sync, end_reading
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -228,8 +229,8 @@ def test_as_many_positions_may_be_missed_as_the_configuration_says(most: int) ->
     axis.on_status(ENABLED, T)
     for cycle in range(most + 1):
         assert axis.find_fault(T, WANTED) is None, cycle
-        axis.sync_sent()
+        count_sync(axis)
         if cycle == 0:
             axis.on_position(canopen_frames.POSITION.pack(1000), T)
-        axis.read_over()
+        end_reading(axis)
     assert axis.find_fault(T, WANTED) == ("B", "silent", 0, f"drive B: no position for {most} cycles in a row")

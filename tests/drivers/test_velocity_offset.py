@@ -194,15 +194,16 @@ def test_an_offset_that_does_not_fit_is_refused_with_the_way_out(closing: Closin
     with pytest.raises(
         BusError,
         match=r"^1250 Hz takes 110% of the bus at 850000 bit/s; the highest rate that fits is 1134 Hz; "
-        r'drives\.velocity_offset = "auto" uses 92 %$',
+        r'drives\.velocity_offset = "auto" uses 92 % or CAN FD \(can\.fd = true\), if the drives and the adapter have '
+        r"it, uses 49 %$",
     ):
         rig.drives.configure(1.0 / FAST)
     assert not rig.bus.sent, "no drive has been contacted"
 
 
 def test_no_way_out_is_named_that_does_not_fit_either(closing: Closing, files: dict[str, Path]) -> None:
-    rig = closing(Rig(files, bitrate=500_000, velocity_offset="always"))
-    with pytest.raises(BusError, match=r"the highest rate that fits is 665 Hz$"):
+    rig = closing(Rig(files, bitrate=250_000, velocity_offset="always"))
+    with pytest.raises(BusError, match=r"the highest rate that fits is 329 Hz$"):
         rig.drives.configure(1.0 / FAST)
 
 

@@ -1,6 +1,7 @@
 """Compiled code is kept from one start to the next, and thrown away when any of its sources changes."""
 
 import os
+import re
 import runpy
 import shutil
 import subprocess
@@ -8,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import trirail_drivers
 from trirail.kinematics import compiled
 
 pytestmark = pytest.mark.long
@@ -107,6 +109,17 @@ def test_every_room_with_compiled_code_belongs_to_the_fingerprint(folder: Path, 
     with (tmp_path / edited.relative_to(PACKAGE)).open("a") as text:
         text.write("# edited\n")
     assert fingerprint() != compiled.FINGERPRINT
+
+
+def test_every_file_of_the_drivers_that_compiled_code_uses_belongs_to_the_fingerprint() -> None:
+    used = set()
+    for file in (file for folder in FOLDERS for file in folder.glob("*.py")):
+        text = file.read_text(encoding="utf-8")
+        if "\n@compiled(" in text:
+            for module, names in re.findall(r"^from trirail_drivers\.([\w.]+) import (.+)$", text, re.MULTILINE):
+                inside = Path(trirail_drivers.__file__).parent / module.replace(".", "/")
+                used |= {f"{module}/{name}" for name in names.split(", ")} if inside.is_dir() else {module}
+    assert {f"{module.replace('.', '/')}.py" for module in used} == set(compiled.DRIVERS)
 
 
 def test_processes_that_start_together_compile_once(room: Path, tmp_path: Path) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import cast
 
 import pytest
 from conftest import Followers, Rig, alone, what_memory_takes
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.control.control import TimedInput
 from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
-from trirail.processes.loop import Loop
+from trirail.processes.loop import Loop, TimeBudget
 from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
 from trirail.processes.reports import BATCHES_PER_SECOND
 from trirail.processes.requests import MAX_COMMANDS, MAX_GOALS
@@ -288,6 +291,50 @@ def test_what_had_to_wait_is_decided_by_a_cycle_later(shell: Shell) -> None:
     shell.serves = False
     shell.cycles(1)
     assert shell.planner.receive() is not None
+
+
+@given(durations=st.lists(st.integers(0, 5_000_000)))
+def test_a_budget_follows_the_longest_recent_duration_within_its_limits(durations: list[int]) -> None:
+    shortest, longest = 150_000, 1_000_000
+    budget = TimeBudget(shortest, longest)
+    for duration in durations:
+        before = budget.ns
+        budget.note(duration)
+        assert min(duration, longest) <= budget.ns <= max(before, duration)
+        assert shortest <= budget.ns <= longest
+        assert budget.ns >= 0.9 * before
+    for _ in range(200):
+        budget.note(0)
+    assert budget.ns == shortest
+
+
+def test_on_a_slow_machine_only_the_first_report_makes_a_cycle_late(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moving(shell)
+    decide, send = shell.loop.control.decide, shell.loop._send_reports
+
+    def slow_decide(inputs: Iterable[TimedInput]) -> None:
+        inputs, before = list(inputs), shell.loop.control.schedule.version
+        decide(inputs)
+        requested = any(isinstance(each, GoalRequest) for each, _ in inputs)
+        shell.took_ns += 700_000 if requested or shell.loop.control.schedule.version != before else 100_000
+
+    def slow_send() -> None:
+        send()
+        shell.took_ns += 300_000
+
+    monkeypatch.setattr(shell.loop.control, "decide", slow_decide)
+    monkeypatch.setattr(shell.loop, "_send_reports", slow_send)
+    late = 0
+    for ticket in range(2, 12):
+        shell.send(ticket, f"g-{ticket}", PoseGoal(0.05, 0.001 * ticket, 0.0))
+        for _ in range(20):
+            shell.took_ns = 50_000
+            shell.cycles(1)
+            late += shell.took_ns > 1_000_000
+    assert late == 1
+    assert sum(event.outcome == "preempted" for event in shell.events()) == 10
 
 
 def test_a_machine_that_stands_still_is_no_frozen_gateway(shell: Shell) -> None:

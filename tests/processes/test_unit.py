@@ -161,6 +161,12 @@ def test_the_can_interface_comes_up_with_bitrate_and_queue(systemd: Systemd) -> 
     ]
 
 
+def test_the_can_interface_comes_up_with_can_fd(systemd: Systemd) -> None:
+    systemd.ctl("set-environment", "FD=dbitrate 5000000 fd on")
+    systemd.ctl("start", "trirail-can@can0")
+    assert "ip link set can0 up type can bitrate 1000000 dbitrate 5000000 fd on" in systemd.commands.read_text()
+
+
 @pytest.mark.parametrize("unit", [UNIT, CAN_UNIT])
 def test_systemd_finds_nothing_wrong_with_what_is_shipped(unit: Path, tmp_path: Path) -> None:
     text = unit.read_text(encoding="utf-8").replace("/opt/trirail/.venv/bin/trirail", sys.executable)

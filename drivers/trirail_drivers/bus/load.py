@@ -85,7 +85,7 @@ class TrafficPlan(NamedTuple):
     full_load: float | None = None
     """Bus load with the velocity offset, if the velocity offset is left out because of this load; otherwise None."""
     remedy: str = ""
-    """Change of the configuration that would shorten the setpoints, or ""."""
+    """Changes of the configuration with which the frames would fit, if the load is too high; otherwise ""."""
 
     @property
     def omission(self) -> str:

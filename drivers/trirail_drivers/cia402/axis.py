@@ -14,6 +14,7 @@ from trirail_drivers.config import DigitalIo, Drives
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.axis_row import NOTHING_SENT
 from trirail_drivers.driver.cyclic import expected_row
+from trirail_drivers.driver.row_updates import accept_counts
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -160,11 +161,8 @@ class Cia402Axis(Axis):
             self.came = True
             return
         counts, statusword = self.exchange.feedback.unpack(data)
-        if abs(counts - self.stands_at) > self.still:
-            self.stands_at, self.stands_since = counts, now
-        self.stands_since = min(self.stands_since, now)
         self._answers_per_sync.add_position(counts)
-        self.update_position(counts)
+        accept_counts(self, counts, now)
         self.answer()
         if statusword is not None:
             self.status_heard = now

@@ -31,6 +31,7 @@ from trirail_drivers.driver.axis_row import NO_OFFSET, NOTHING_SENT
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
+from trirail_drivers.driver.row_updates import count_sync, end_reading
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 from trirail_drivers.timing import BusTiming
@@ -188,8 +189,7 @@ class Cia402(Driver[Cia402Axis]):
         for frame in frames_due[sent:]:
             self._wire.send(frame)
         for axis in self._axes:
-            axis.sync_sent()
-            axis.command_age += 1
+            count_sync(axis)
 
     def read(self) -> Feedback:
         """Handle every frame that has arrived, and return the feedback."""
@@ -199,7 +199,7 @@ class Cia402(Driver[Cia402Axis]):
             if self._wire.down:
                 axis.lose(stopping=self._off_deadline != math.inf)
             mistaken = axis.end_cycle()
-            axis.read_over()
+            end_reading(axis)
             if self._wire.fault is not None and axis.configured:
                 axis.watch_silence(now, self._period)
             if mistaken is not None and self._wire.fault is mistaken:

@@ -95,13 +95,12 @@ class AnswersPerSync:
         """Number of the SYNC at which counting began."""
 
     def add_position(self, counts: int) -> None:
-        """Handle a received position [counts]."""
+        """Handle a received position [counts], before it is stored in the row."""
         row = self._row
-        step, before = counts - row.newest, row.step
+        step = counts - row.newest
         if row.came:
-            self._two = self._two or step * before < 0
+            self._two = self._two or step * row.step < 0
             self._far = self._far or abs(step) > self._counts_far
-        row.newest, row.step = counts, step or before
 
     @property
     def is_clear(self) -> bool:

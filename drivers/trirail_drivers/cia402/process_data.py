@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from struct import Struct
 from typing import Final
@@ -10,7 +10,7 @@ from typing import Final
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.load import HIGH_LOAD, Traffic, TrafficPlan, percent
 from trirail_drivers.cia402 import canopen_frames
-from trirail_drivers.config import NO_IO, DigitalIo, Drives
+from trirail_drivers.config import DATA_BITRATE, NO_IO, DigitalIo, Drives
 from trirail_drivers.timing import BusTiming
 
 INTERPOLATED_POSITION: Final = 7
@@ -228,11 +228,23 @@ def plan_traffic(drives: Drives, io: Sequence[DigitalIo], rate_hz: float, timing
     )
     load = full.bus_load(rate_hz, timing, drives.heartbeat)
     if drives.velocity_offset == "never":
-        return TrafficPlan(short, 4, velocity_offset=False)
-    if load <= HIGH_LOAD:
-        return TrafficPlan(full)
-    if drives.velocity_offset == "always":
-        shorter = short.bus_load(rate_hz, timing, drives.heartbeat)
-        remedy = f'drives.velocity_offset = "auto" uses {percent(shorter)}' if shorter <= 1.0 else ""
-        return TrafficPlan(full, remedy=remedy)
-    return TrafficPlan(short, 4, velocity_offset=False, full_load=load)
+        plan = TrafficPlan(short, 4, velocity_offset=False)
+    elif load <= HIGH_LOAD or drives.velocity_offset == "always":
+        plan = TrafficPlan(full)
+    else:
+        plan = TrafficPlan(short, 4, velocity_offset=False, full_load=load)
+    return plan._replace(remedy=" or ".join(_remedies(plan.traffic, short, rate_hz, timing, drives.heartbeat)))
+
+
+def _remedies(used: Traffic, short: Traffic, rate_hz: float, timing: BusTiming, heartbeat: float) -> Iterator[str]:
+    """Yield the settings with which the traffic fits on a bus that is now loaded too highly.
+
+    `short` is the traffic without the velocity offset.
+    """
+    if used.bus_load(rate_hz, timing, heartbeat) <= HIGH_LOAD:
+        return
+    if used != short and (load := short.bus_load(rate_hz, timing, heartbeat)) <= 1.0:
+        yield f'drives.velocity_offset = "auto" uses {percent(load)}'
+    fd = BusTiming(timing.bitrate, DATA_BITRATE)
+    if not timing.fd and (load := used.bus_load(rate_hz, fd, heartbeat)) <= HIGH_LOAD:
+        yield f"CAN FD (can.fd = true), if the drives and the adapter have it, uses {percent(load)}"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from trirail_drivers.config import DigitalIo, Drives
 from trirail_drivers.driver.axis_row import AXIS, NOTHING_SENT, AxisRow
+from trirail_drivers.driver.row_updates import accept_answer, answered_sync, is_late
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Counts, DriveFault
@@ -34,28 +35,12 @@ class Answers(AxisRow):
         """Number of unanswered SYNCs. The newest SYNC is not counted while its answer is not yet due."""
         return self.syncs - self.sampled - (not self.prompt)
 
-    def sync_sent(self) -> None:
-        """Count a SYNC that was sent."""
-        self.syncs += 1
-        self.between = False
-
-    def read_over(self) -> None:
-        """Record that this cycle's frames have been read: a position that arrives later is a late answer."""
-        self.between, self.came = True, False
-
     def answer(self) -> None:
         """Assign a received position to the SYNC that it answers."""
-        self.came = True
-        between, prompt, before, syncs = self.between, self.prompt, self.sampled, self.syncs
-        answers_previous = not between and not prompt and before < syncs - 1
-        sampled = syncs - answers_previous
-        if sampled - before > 1:
-            self.lost += sampled - before - 1
-        # Late means later in the cycle than the answer before: a drive that always answers after the read is not late.
-        if prompt and between and sampled > before:
-            self.late += 1
-        self.sampled = sampled
-        self.prompt = not between and not answers_previous
+        sampled = answered_sync(self)
+        self.lost += max(0, sampled - self.sampled - 1)
+        self.late += is_late(self, sampled)
+        accept_answer(self, sampled)
 
     def clear_missed(self) -> None:
         """Forget the unanswered SYNCs."""

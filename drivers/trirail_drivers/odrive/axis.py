@@ -9,6 +9,7 @@ from trirail_drivers.bus.wire import Handler
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.cyclic import expected_row
+from trirail_drivers.driver.row_updates import accept_turns
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import cansimple
@@ -121,7 +122,7 @@ class OdriveAxis(Axis):
             return
         self.answer()
         if math.isfinite(turns):
-            self.position = self.scale.metres(turns)
+            accept_turns(self, turns)
         else:
             self.note_fault("frame", 0, f"position estimate is {turns}; check that its encoder has been calibrated")
 

@@ -26,6 +26,7 @@ from trirail_drivers.driver.axis_row import NO_OFFSET
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
+from trirail_drivers.driver.row_updates import count_sync, end_reading
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import cansimple, setup
 from trirail_drivers.odrive.axis import OdriveAxis
@@ -141,7 +142,7 @@ class Odrive(Driver[OdriveAxis]):
         for number, (axis, request) in enumerate(zip(self._axes, self._requests, strict=True)):
             if number >= sent:
                 self._wire.send(request)
-            axis.sync_sent()
+            count_sync(axis)
         if now >= errors_due:
             self._errors_due = now + cansimple.ERROR_PERIOD
             self._wire.send(self._error_requests[self._next_request])
@@ -152,7 +153,7 @@ class Odrive(Driver[OdriveAxis]):
         now = self._clock()
         self._wire.receive(now)
         for axis in self._axes:
-            axis.read_over()
+            end_reading(axis)
             if self._wire.fault is not None and axis.configured:
                 axis.watch_silence(now, self._period)
         if self._wire.fault is None:

@@ -6,6 +6,7 @@ has ended. No function that stops the robot waits for the planner.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -87,6 +88,10 @@ class PlanRequests:
         self._number = 0
         self._request: PlanRequest | None = None
         self._answer: PlanAnswer | None = None
+        self._planned_run: Run | None = None
+        """Motion of the answer, unpacked when the answer arrived, so that less is left to do in the cycle when the
+        motion begins.
+        """
         self._lost: str | None = None
         self._attempts = 0
         self._answer_cycles = 0
@@ -157,11 +162,11 @@ class PlanRequests:
         """
         self._goal_id = name
         self._goal, self._blend, self._attempts, self._since = goal, blend, 0, None
-        self._request = self._answer = self._lost = None
+        self._request = self._answer = self._planned_run = self._lost = None
 
     def cancel(self) -> None:
         """Stop planning the goal, and ignore answers that arrive later."""
-        self._goal = self._request = self._answer = self._lost = self._since = None
+        self._goal = self._request = self._answer = self._planned_run = self._lost = self._since = None
 
     def set_running(self, running: bool) -> None:
         """Run the current motion at the speed override, or brake to a standstill."""
@@ -182,6 +187,9 @@ class PlanRequests:
         asked = self._request
         if asked is not None and (answer.number, answer.version) == (asked.number, asked.version) and not self._answer:
             self._answer, self._since = answer, None
+            if isinstance(answer, PreemptingMotion):
+                with contextlib.suppress(ValueError):  # an invalid motion is refused when it would begin
+                    self._planned_run = unpack_run(self._legs, answer.run)
             self._answer_cycles = self._schedule.cycle - asked.cycle
 
     def fail(self, reason: str) -> None:
@@ -236,7 +244,7 @@ class PlanRequests:
             raise RefusedError(RefusalCode.NO_PLAN, text)
         schedule, (pose, velocity, acceleration) = self._schedule, self._schedule.commanded
         self._number += 1
-        self._answer = None
+        self._answer = self._planned_run = None
         self._request = PlanRequest(
             self._number,
             schedule.version,
@@ -281,7 +289,7 @@ class PlanRequests:
         schedule = self._schedule
         if planned.first is not None and schedule.cycle < planned.first:
             return None  # not due yet
-        run = unpack_run(self._legs, planned.run)
+        run = self._planned_run or unpack_run(self._legs, planned.run)
         run.marks.append(self._marks(planned.switches))
         runs = deque([run])
         if planned.reply.stops_first and schedule.runs:

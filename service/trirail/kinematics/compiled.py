@@ -8,6 +8,7 @@ import hashlib
 import operator
 import re
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -21,15 +22,28 @@ R = TypeVar("R")
 ROOMS = ("kinematics", "motion", "control", "processes")
 """Folders with compiled functions. Compiled functions contain code and constants from other files. An edit in any of
 these folders therefore invalidates all cached functions."""
+DRIVERS = (
+    "bus/can_frame.py",
+    "driver/axis_row.py",
+    "driver/cyclic.py",
+    "driver/row_updates.py",
+    "driver/scaling.py",
+    "interface.py",
+)
+"""Files of trirail_drivers with constants of compiled functions, or with functions that are also compiled."""
 
 
 def _sources() -> bytes:
     package = Path(__file__).parents[1]
+    drivers = find_spec("trirail_drivers")
+    folders = drivers.submodule_search_locations if drivers is not None else None
+    shared = b"".join(Path(folder, file).read_bytes() for folder in folders or () for file in DRIVERS)
     files = [file for room in ROOMS for file in sorted((package / room).rglob("*.py"))]
     sources = [(file.relative_to(package).parts[0], file.read_bytes()) for file in files]
     # In the kinematics, any file may define constants of compiled functions; in other folders, only files that contain
     # compiled functions.
-    return b"".join(source for room, source in sources if room == ROOMS[0] or b"@compiled(" in source)
+    own = (source for room, source in sources if room == ROOMS[0] or b"@compiled(" in source)
+    return b"".join(own) + shared
 
 
 FINGERPRINT = hashlib.sha256(_sources()).hexdigest()

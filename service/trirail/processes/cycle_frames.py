@@ -18,6 +18,7 @@ from numba import f8, from_dtype, i4, i8, types, u1, u8
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 from trirail_drivers.bus.can_frame import DATA_AT, FRAME_SIZES, LENGTH_AT
+from trirail_drivers.driver import row_updates
 from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET
 from trirail_drivers.driver.cyclic import EXPECTED, MOST_FRAMES, TIMES
 from trirail_drivers.driver.scaling import INT32_MAX
@@ -132,44 +133,39 @@ def _signed(number: int) -> int:
     return number - (1 << 32) if number >> 31 else number
 
 
+# The drivers run these functions as Python.
+_count_sync: Any = compiled()(row_updates.count_sync)
+_end_reading: Any = compiled()(row_updates.end_reading)
+_answered_sync: Any = compiled()(row_updates.answered_sync)
+_is_late: Any = compiled()(row_updates.is_late)
+_accept_answer: Any = compiled()(row_updates.accept_answer)
+_accept_counts: Any = compiled()(row_updates.accept_counts)
+_accept_turns: Any = compiled()(row_updates.accept_turns)
+
+
 @compiled()
 def _answers_in_time(axis: Any) -> bool:
-    """Count a received position as the answer to a SYNC, like trirail_drivers.driver.axis.Answers.answer.
+    """Store that a position has arrived in time.
 
-    Return True if it was counted. Return False, and count nothing, if the SYNC was answered before, or if an answer was
-    late or lost.
+    Return False, and store nothing, if the SYNC was answered before, or if an answer was late or lost.
     """
-    to_the_one_before = not axis.between and not axis.prompt and axis.sampled < axis.syncs - 1
-    sampled = axis.syncs - to_the_one_before
-    late = axis.prompt and axis.between and sampled > axis.sampled
-    if axis.came or late or sampled - axis.sampled > 1:
+    sampled = _answered_sync(axis)
+    if axis.came or _is_late(axis, sampled) or sampled - axis.sampled > 1:
         return False
-    axis.came, axis.sampled, axis.prompt = True, sampled, not axis.between and not to_the_one_before
+    _accept_answer(axis, sampled)
     return True
 
 
 @compiled()
-def _accept_counts(axis: Any, counts: int, now: float) -> bool:
-    """Store a position [counts]. Return False, and change nothing, if it did not arrive in time."""
-    if not _answers_in_time(axis):
+def _accept_position(axis: Any, frame: NDArray[np.uint8], at: int, now: float) -> bool:
+    """Store the position at an offset of a frame. Return False, and store nothing, if Python must handle the frame."""
+    turns = float(frame[at : at + 4].view(np.float32)[0])
+    if (axis.floats and not math.isfinite(turns)) or not _answers_in_time(axis):
         return False
-    if abs(counts - axis.stands_at) > axis.still:
-        axis.stands_at, axis.stands_since = counts, now
-    axis.stands_since = min(axis.stands_since, now)
-    step = counts - axis.newest
-    if step:
-        axis.step = step
-    axis.newest, axis.actual = counts, counts
-    axis.position = counts / axis.counts_per_metre + axis.zero
-    return True
-
-
-@compiled()
-def _accept_turns(axis: Any, turns: float) -> bool:
-    """Store a position [turns]. Return False, and change nothing, if it is not finite or did not arrive in time."""
-    if not math.isfinite(turns) or not _answers_in_time(axis):
-        return False
-    axis.position = turns / axis.counts_per_metre + axis.zero
+    if axis.floats:
+        _accept_turns(axis, turns)
+    else:
+        _accept_counts(axis, _signed(_number(frame, at, 4)), now)
     return True
 
 
@@ -208,13 +204,8 @@ def process_frames(
             if frame[DATA_AT + k] & row.mask[k] != row.data[k]:
                 return i
         axis = axes[row.axis]
-        if row.position_at != NO_OFFSET:
-            at = DATA_AT + row.position_at
-            if axis.floats:
-                if not _accept_turns(axis, float(frames[i, at : at + 4].view(np.float32)[0])):
-                    return i
-            elif not _accept_counts(axis, _signed(_number(frame, at, 4)), now):
-                return i
+        if row.position_at != NO_OFFSET and not _accept_position(axis, frame, DATA_AT + row.position_at, now):
+            return i
         if row.status_at != NO_OFFSET:
             axis.statusword = _number(frame, DATA_AT + row.status_at, 2)
             axis.seen_clear |= ~axis.statusword
@@ -230,9 +221,7 @@ def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
     """Record that the SYNC has been sent, and that setpoints which take effect at a SYNC are now in force."""
     for i in range(3):
         axis = axes[i]
-        axis.syncs += 1
-        axis.between = False
-        axis.command_age += 1
+        _count_sync(axis)
         if len(history):
             history[axis.syncs % len(history), i] = axis.sent
         if axis.waits:
@@ -260,7 +249,7 @@ def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, no
     if not now < times[0].due:
         return False
     for i in range(3):
-        axes[i].between, axes[i].came = True, False
+        _end_reading(axes[i])
     return True
 
 

@@ -29,12 +29,14 @@ from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import Mode
 
 DECISION_BUDGET_NS = 300_000
-"""Time needed to handle requests before the next tick [ns].
+"""Shortest time that must be left before the next tick to handle requests [ns].
 
 If less time is left, the requests wait until the setpoints of the next cycle have been sent.
 """
 REPORT_BUDGET_NS = 150_000
-"""Time needed to send events and answers before the next tick [ns]."""
+"""Shortest time that must be left before the next tick to send events and answers [ns]."""
+BUDGET_DECAY = 1 / 32
+"""Fraction by which a budget shrinks each time the work takes less time than the budget."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
 """Minimum time-out for the gateway's heartbeat, in cycles."""
 MAX_SHUTDOWN_S = 3.0
@@ -42,6 +44,23 @@ MAX_SHUTDOWN_S = 3.0
 
 After this time the loop ends, and the drives stop by themselves.
 """
+
+
+class TimeBudget:
+    """Time that a kind of work needs before the next tick, which is longer on a slower machine.
+
+    It is the longest recent duration of the work, within limits [ns].
+    """
+
+    def __init__(self, shortest_ns: int, longest_ns: int) -> None:
+        self._shortest_ns = shortest_ns
+        self._longest_ns = max(shortest_ns, longest_ns)
+        self.ns = shortest_ns
+
+    def note(self, duration_ns: int) -> None:
+        """Take a duration of the work into account."""
+        shrunk_ns = round(self.ns * (1 - BUDGET_DECAY))
+        self.ns = min(max(self._shortest_ns, shrunk_ns, duration_ns), self._longest_ns)
 
 
 class Loop:
@@ -88,6 +107,8 @@ class Loop:
         self._overruns = Overruns(config.watchdogs.max_overruns)
         self._heart = heartbeats.heart("loop")
         self._urgent_flag = UrgentFlag(heartbeats)
+        self._decision_budget = TimeBudget(DECISION_BUDGET_NS, self._period_ns)
+        self._report_budget = TimeBudget(REPORT_BUDGET_NS, self._period_ns)
         self._poll_set = PollSet(ports)
         self._never_listens = self._period_ns <= SPARE_NS
         self._listened = self._never_listens
@@ -217,13 +238,19 @@ class Loop:
         self._drives.next_sync = next_ns * 1e-9
         if called or waited:
             self._gateway.read()
-            in_time = waited or next_ns - self._now() >= DECISION_BUDGET_NS
+            began_ns = self._now()
+            in_time = waited or next_ns - began_ns >= self._decision_budget.ns
             self.control.decide(self._noted(next_ns, self._gateway.requests() if in_time else ()))
-        if self._reports_postponed or ((called or waited) and next_ns - self._now() >= REPORT_BUDGET_NS):
-            self._send_reports()
-        elif called or waited:
-            self._reports_postponed = True
-            self._reports.postpone()
+            if in_time:
+                self._decision_budget.note(self._now() - began_ns)
+        if called or waited or self._reports_postponed:
+            began_ns = self._now()
+            if self._reports_postponed or next_ns - began_ns >= self._report_budget.ns:
+                self._send_reports()
+                self._report_budget.note(self._now() - began_ns)
+            else:
+                self._reports_postponed = True
+                self._reports.postpone()
         if self._reports.full:
             self._flush()
 

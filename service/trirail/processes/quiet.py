@@ -40,6 +40,7 @@ from trirail.processes.cycle_frames import (
     set_frames,
 )
 from trirail.processes.heartbeats import URGENT_INDEX
+from trirail.processes.quiet_state import STATE
 from trirail.wire.records import MAX_PART_NS, Part
 
 _PEER_GONE: Final = (0x008 | 0x010) << 16
@@ -73,58 +74,6 @@ CONTINUE: Final = -1
 """Result of a stage of a cycle if the cycle continues with the next stage."""
 FOLLOW, HOLD, COMMAND = 0, 1, 2
 """Sources of the setpoints: FOLLOW for the measured positions, HOLD for a platform at rest, COMMAND for a motion."""
-
-STATE = np.dtype(
-    [
-        ("period_ns", "<i8"),
-        ("period", "<f8"),  # period [s]
-        ("injected_ns", "<i8"),  # time of an injected clock in tests; negative to use the monotonic clock
-        ("deadline_ns", "<i8"),  # time at which the newest tick was due
-        ("lateness_ns", "<i8"),
-        ("synced", "<f8"),  # time at which the SYNC of the newest cycle was sent [s]
-        ("marked_ns", "<i8"),  # time at which the newest part of the cycle ended
-        ("cycle", "<i8"),
-        ("until", "<i8"),  # last cycle that may be run
-        ("due", "<i8"),  # cycle after which a decision is due
-        ("overruns", "<i8"),  # number of missed ticks since the start
-        ("in_a_row", "<i8"),  # number of consecutive missed ticks before the newest tick
-        ("allowed", "<i8"),  # tolerated maximum of in_a_row
-        ("missed", "<i8"),  # number of ticks missed immediately before the newest tick
-        ("parts_ns", "<i4", len(Part)),
-        ("mode", "u1"),  # number of the mode, as in a record
-        ("source", "u1"),  # FOLLOW, HOLD or COMMAND
-        ("held", "u1"),  # argument of trirail.control.cycle.follow
-        ("at_rest", "u1"),  # argument of trirail.control.cycle.observe
-        ("in_sliders", "u1"),  # property of the path
-        ("behind", "<i8"),  # result of trirail.control.cycle.observe
-        ("code", "<i8"),  # result of trirail.control.cycle.command
-        ("time", "<f8"),  # time in the law of the motion [s]
-        ("target", "<f8"),  # rate to which the law leads
-        ("course", "<f8", 3),  # values of a trirail.motion.runs.GoalSpan
-        ("fastest", "<f8"),  # argument of trirail.control.cycle.observe
-        ("limit", "<f8"),  # argument of trirail.control.cycle.observe
-        ("step", "<f8"),  # argument of trirail.control.cycle.follow
-        ("settles", "u1"),  # 1 if a goal waits until the robot is in position
-        ("timeout", "<i8"),  # cycle at which that wait times out
-        ("urgent_seen", "<u8"),  # count of urgent requests at the last check
-        ("listens", "u1"),  # 1 if a call during the wait for the next tick is served immediately
-        ("called", "u1"),  # 1 if a decision is due after the newest cycle
-        ("gateway_seen", "<u8"),  # this and the next two: state of a trirail.processes.heartbeats.Watch
-        ("gateway_turns", "<i8"),
-        ("gateway_patience", "<i8"),
-        ("gateway_place", "<i8"),  # index of the gateway's heartbeat
-        ("batched", "<i8"),  # number of records in the batch
-        ("handled", "<i8"),  # number of frames that have been processed
-        ("arrived", "<i8"),  # number of frames that have been received; Python must process those not handled
-        ("error", "<i8"),  # error of receiving frames, a number of errno.h
-        ("sent", "<i8"),  # number of setpoints that the bus has accepted
-        ("logged", "<i8"),  # number of rows in the log of switches
-        ("report_due", "<i8"),  # cycle after which the log of switches is reported
-        ("report_after", "<i8"),  # number of cycles from the first row of the log to its report
-    ],
-    align=True,
-)
-"""State of the compiled call between cycles, with its settings and its results."""
 
 _STATE = from_dtype(STATE)[::1]
 
@@ -270,7 +219,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
         s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
         return Reached.CALLED
     now, s.listens = _now_ns(state, moment), s.period_ns > SPARE_NS
-    s.marked_ns, s.handled, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0, 0
+    s.marked_ns, s.handled, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0, False
     s.lateness_ns = now - s.deadline_ns
     s.missed = max(0, s.lateness_ns // s.period_ns)
     t = now / 1e9
@@ -333,7 +282,7 @@ def _solve(
     """Evaluate the feedback, and write the next setpoints into their frames. Return CONTINUE, or the reached stage."""
     s = state[0]
     s.behind = cycle.observe(
-        *(robot.legs, robot.feedback, robot.written, robot.backlash, s.period, s.fastest, s.limit, s.at_rest != 0),
+        *(robot.legs, robot.feedback, robot.written, robot.backlash, s.period, s.fastest, s.limit, s.at_rest),
         *(robot.jumps, robot.scratch, robot.monitored, robot.record),
     )
     if s.behind:
@@ -343,7 +292,7 @@ def _solve(
     if s.source == COMMAND:
         s.time += s.period
         code = cycle.command(
-            *(robot.legs, robot.bounds, motion.knots, motion.pieces, s.in_sliders != 0, motion.tools),
+            *(robot.legs, robot.bounds, motion.knots, motion.pieces, s.in_sliders, motion.tools),
             *(motion.law_knots, motion.law_pieces, s.time, s.target),
             *(motion.furthest, s.course[0], s.course[1], s.course[2]),
             robot.motion,
@@ -360,7 +309,7 @@ def _solve(
     else:
         code = 0
         cycle.follow(
-            *(robot.legs, robot.feedback, robot.jumps, s.held != 0, False, s.step),
+            *(robot.legs, robot.feedback, robot.jumps, s.held, False, s.step),
             *(robot.motion, robot.sliders, robot.backlash, robot.record),
         )
     monitored = robot.monitored[0]
@@ -387,7 +336,7 @@ def _switch_outputs(
         *(tables.switches, tables.planned, tables.words, tables.log, s.logged, motion.law_knots, motion.law_pieces),
         *(s.source == COMMAND, s.time, s.period, s.cycle + 1, s.deadline_ns, record),
     )
-    s.called |= s.logged >= outputs.TABLE_LENGTH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
+    s.called = s.called or s.logged >= outputs.TABLE_LENGTH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
     for i in range(3):
         axes[i].outputs = record[0].outputs[i] = tables.words[i]
     return True

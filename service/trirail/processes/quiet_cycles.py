@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import MutableSequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,12 +15,12 @@ from trirail.processes import quiet
 from trirail.processes.clock import Overruns, PollSet, Ticker
 from trirail.processes.heartbeats import PROCESSES, URGENT_INDEX, Heartbeats, UrgentFlag, Watch
 from trirail.processes.quiet import Reached
+from trirail.processes.quiet_state import STATE, QuietState
 from trirail.processes.reports import Reports
 from trirail.wire.links import Port
 from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import MODES
 
-_NAMES = quiet.STATE.names or ()
 _MAX_CYCLES = 1 << 40
 """Maximum number of cycles per call. It is larger than any batch, so that the batch ends the call."""
 _NO_CYCLE = 1 << 62
@@ -72,7 +71,7 @@ class QuietCycles:
         self._watch = watch
         self._urgent_flag = urgent_flag
         self._hearts = np.frombuffer(hearts.counts, np.uint64)[: URGENT_INDEX + 1]
-        self._state = np.zeros(1, quiet.STATE)
+        self._state = QuietState()
         self._moment = np.zeros(2, np.int64)
         self._poll_set = poll_set
         self._lent: Cyclic | None = None
@@ -86,13 +85,13 @@ class QuietCycles:
         """Arguments of the compiled function, valid until the drives lend other tables or the motion changes."""
         self._nothing = np.zeros(1)
         measured, setpoints = control.measured, control.setpoints
-        state = self._state[0]
-        self.parts_ns: MutableSequence[int] = state["parts_ns"]
+        state = self._state
+        self.parts_ns = state.parts_ns
         """Durations of the parts of the newest cycle [ns], in the memory to which compiled code writes."""
-        state["period"], state["period_ns"] = control.period, round(control.period * 1e9)
-        state["injected_ns"] = -1
-        state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
-        state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
+        state.period, state.period_ns, state.injected_ns = control.period, round(control.period * 1e9), -1
+        state.fastest, state.limit, state.step = measured.fastest, measured.limit, setpoints.step
+        state.gateway_place, state.gateway_patience = PROCESSES.index("gateway"), watch.patience
+        state.report_after = control.outputs.report_after
 
     def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool, once: bool) -> QuietResult | None:
         """Run cycles until an event or the end of a batch, and return the result for the newest cycle.
@@ -107,42 +106,36 @@ class QuietCycles:
             True to run only one cycle, because messages wait to be sent after that cycle.
 
         """
-        control, state = self._control, self._state[0]
+        control, state = self._control, self._state
         if not ((once or self._reports.idle) and self._gateway.no_peer_lost and self._tables_ready()):
             self.leave()
             return None
-        watch = self._watch
-        state["injected_ns"], state["deadline_ns"] = ticker.sleep_if_injected(), ticker.deadline_ns
-        state["overruns"], state["in_a_row"], state["allowed"] = overruns.all, overruns.in_a_row, overruns.allowed
-        state["until"] = control.cycles + (1 if once or state["injected_ns"] >= 0 else _MAX_CYCLES)
-        state["batched"] = self._reports.batched
-        state["gateway_seen"], state["gateway_turns"], state["urgent_seen"] = (
-            watch.seen,
-            watch.silent_turns,
-            self._urgent_flag.seen,
-        )
-        state["listens"] = listens
-        state["report_after"] = control.outputs.report_after
-        state["logged"], state["report_due"] = control.outputs.logged, control.outputs.report_due
+        watch, before = self._watch, control.cycles
+        state.injected_ns, state.deadline_ns = ticker.sleep_if_injected(), ticker.deadline_ns
+        state.overruns, state.in_a_row, state.allowed = overruns.all, overruns.in_a_row, overruns.allowed
+        state.until = before + (1 if once or state.injected_ns >= 0 else _MAX_CYCLES)
+        state.batched, state.listens = self._reports.batched, listens
+        state.gateway_seen, state.gateway_turns = watch.seen, watch.silent_turns
+        state.urgent_seen = self._urgent_flag.seen
+        state.logged, state.report_due = control.outputs.logged, control.outputs.report_due
         self._poll_set.refresh()
         reached = Reached(quiet.run(*self._tables, *self._motion))
-        left = dict(zip(_NAMES, state.item(), strict=True))  # faster than reading each field separately
-        overruns.all, overruns.in_a_row = left["overruns"], left["in_a_row"]
-        watch.seen, watch.silent_turns = left["gateway_seen"], left["gateway_turns"]
-        self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
-        self.cycles += left["cycle"] - control.cycles
-        control.outputs.update_log(left["logged"], left["report_due"])
-        decides = bool(left["called"]) and reached in (Reached.WRITTEN, Reached.DONE)
+        overruns.all, overruns.in_a_row = state.overruns, state.in_a_row
+        watch.seen, watch.silent_turns = state.gateway_seen, state.gateway_turns
+        self._reports.batched, ticker.deadline_ns = state.batched, state.deadline_ns
+        self.cycles += state.cycle - before
+        control.outputs.update_log(state.logged, state.report_due)
+        decides = state.called and reached in (Reached.WRITTEN, Reached.DONE)
         called = decides or reached is Reached.CALLED
         self._decided = self._decided or called or once
         if reached not in (Reached.DONE, Reached.CALLED):
-            synced = left["synced"] if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
-            self.leave(left["handled"], left["arrived"], synced=synced, error=max(left["error"], 0))
-        control.resume(left["cycle"], left["time"], left["code"] if decides else None)
+            synced = state.synced if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
+            self.leave(state.handled, state.arrived, synced=synced, error=max(state.error, 0))
+        control.resume(state.cycle, state.time, state.code if decides else None)
         if reached is Reached.WRITTEN:
-            self._drives.send_on(left["sent"])
-        tick = left["deadline_ns"], left["lateness_ns"], left["missed"]
-        return QuietResult(reached, *tick, left["marked_ns"], called, left["behind"], left["code"])
+            self._drives.send_on(state.sent)
+        tick = state.deadline_ns, state.lateness_ns, state.missed
+        return QuietResult(reached, *tick, state.marked_ns, called, state.behind, state.code)
 
     def leave(self, handled: int = 0, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Return lent tables to the drives, with the parameters of trirail_drivers.driver.cyclic.Lender.reclaim."""
@@ -173,21 +166,20 @@ class QuietCycles:
 
     def add(self, part: Part) -> None:
         """Add the time since the newest cycle to the duration of one of its parts; 0 if a simulated clock is ahead."""
-        passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
-        self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, MAX_PART_NS)
+        passed = max(0, time.perf_counter_ns() - self._state.marked_ns)
+        self.parts_ns[part] = min(self.parts_ns[part] + passed, MAX_PART_NS)
 
     def _write_state(self, steady: SteadyState) -> None:
-        state, run = self._state[0], steady.run
-        state["source"] = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
-        state["cycle"], state["mode"] = self._control.cycles, MODES.index(self._control.state.mode)
-        state["held"], state["at_rest"], state["code"] = steady.held, steady.at_rest, steady.code
-        state["due"] = int(min(steady.until, _NO_CYCLE))
-        state["settles"] = steady.settles_by is not None
-        state["timeout"] = steady.settles_by or 0
+        state, run = self._state, steady.run
+        state.source = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
+        state.cycle, state.mode = self._control.cycles, MODES.index(self._control.state.mode)
+        state.held, state.at_rest, state.code = steady.held, steady.at_rest, steady.code
+        state.due = int(min(steady.until, _NO_CYCLE))
+        state.settles, state.timeout = steady.settles_by is not None, steady.settles_by or 0
         runs = self._control.schedule.runs
-        state["time"] = runs[0].time if runs else 0.0
+        state.time = runs[0].time if runs else 0.0
         if run is not None:
-            state["in_sliders"], state["target"], state["course"] = run.path.in_sliders, run.target, run.goal_span
+            state.in_sliders, state.target, state.course = run.path.in_sliders, run.target, run.goal_span
 
     def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
         """Return the arguments of the compiled function that stay the same while the drives lend their tables."""
@@ -225,7 +217,7 @@ class QuietCycles:
             packed=measured.record.view(np.uint8),
         )
         neighbours = quiet.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
-        return self._state, self._moment, neighbours, frames, robot
+        return np.frombuffer(memoryview(self._state), STATE), self._moment, neighbours, frames, robot
 
     def _motion_arguments(self, run: Run | None) -> tuple[quiet.MotionArrays, quiet.OutputArrays]:
         """Return the arguments of the compiled function that depend on the motion."""

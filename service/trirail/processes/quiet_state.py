@@ -1,0 +1,132 @@
+"""State of the compiled call between cycles, with its settings and its results, in memory shared with compiled code."""
+
+from __future__ import annotations
+
+import ctypes
+import inspect
+from collections.abc import MutableSequence
+from typing import Any, Final
+
+import numpy as np
+
+from trirail.wire.records import Part
+
+Unsigned = int
+"""Counter of trirail.processes.heartbeats."""
+PartTimes = MutableSequence[int]
+"""Durations of the parts of a cycle, in the order of trirail.wire.records.Part [ns]."""
+Span = tuple[float, float, float]
+"""Values of a trirail.motion.runs.GoalSpan."""
+
+
+class QuietState(ctypes.Structure):
+    """State of the compiled call; the Python attributes are views of the memory that compiled code uses."""
+
+    # The tick
+    period_ns: int
+    period: float
+    """Period of the loop [s]."""
+    injected_ns: int
+    """Time of an injected clock in tests; negative to use the monotonic clock."""
+    deadline_ns: int
+    """Time at which the newest tick was due."""
+    lateness_ns: int
+    synced: float
+    """Time at which the SYNC of the newest cycle was sent [s]."""
+    marked_ns: int
+    """Time at which the newest part of the cycle ended."""
+    overruns: int
+    """Number of missed ticks since the start."""
+    in_a_row: int
+    """Number of consecutive missed ticks before the newest tick."""
+    allowed: int
+    """Tolerated maximum of `in_a_row`."""
+    missed: int
+    """Number of ticks missed immediately before the newest tick."""
+    parts_ns: PartTimes
+
+    # The cycle
+    cycle: int
+    until: int
+    """Last cycle that may be run."""
+    due: int
+    """Cycle after which a decision is due."""
+    called: bool
+    """Whether a decision is due after the newest cycle."""
+    mode: int
+    """Number of the mode, as in a record."""
+    batched: int
+    """Number of records in the batch."""
+
+    # The motion
+    source: int
+    """Source of the setpoints: FOLLOW, HOLD or COMMAND of trirail.processes.quiet."""
+    held: bool
+    """Argument of trirail.control.cycle.follow."""
+    step: float
+    """Argument of trirail.control.cycle.follow."""
+    at_rest: bool
+    """Argument of trirail.control.cycle.observe."""
+    fastest: float
+    """Argument of trirail.control.cycle.observe."""
+    limit: float
+    """Argument of trirail.control.cycle.observe."""
+    behind: int
+    """Result of trirail.control.cycle.observe."""
+    in_sliders: bool
+    """Property of the path."""
+    time: float
+    """Time in the law of the motion [s]."""
+    target: float
+    """Rate to which the law leads."""
+    course: Span
+    code: int
+    """Result of trirail.control.cycle.command."""
+    settles: bool
+    """Whether a goal waits until the robot is in position."""
+    timeout: int
+    """Cycle at which that wait times out."""
+
+    # The neighbours
+    listens: bool
+    """Whether a call during the wait for the next tick is served immediately."""
+    urgent_seen: Unsigned
+    """Count of urgent requests at the last check."""
+    gateway_seen: Unsigned
+    """Count of the gateway's heartbeats; this and the next two are the state of a trirail.processes.heartbeats.Watch.
+    """
+    gateway_turns: int
+    gateway_patience: int
+    gateway_place: int
+    """Index of the gateway's heartbeat."""
+
+    # The frames
+    arrived: int
+    """Number of frames that have been received; Python must process those not handled."""
+    handled: int
+    """Number of frames that have been processed."""
+    error: int
+    """Error of receiving frames, a number of errno.h."""
+    sent: int
+    """Number of setpoints that the bus has accepted."""
+
+    # The outputs
+    logged: int
+    """Number of rows in the log of switches."""
+    report_due: int
+    """Cycle after which the log of switches is reported."""
+    report_after: int
+    """Number of cycles from the first row of the log to its report."""
+
+
+_KINDS: Final[dict[str, Any]] = {
+    "float": ctypes.c_double,
+    "int": ctypes.c_int64,
+    "bool": ctypes.c_bool,
+    "Unsigned": ctypes.c_uint64,
+    "PartTimes": ctypes.c_int32 * len(Part),
+    "Span": ctypes.c_double * 3,
+}
+QuietState._fields_ = [(name, _KINDS[kind]) for name, kind in inspect.get_annotations(QuietState).items()]
+STATE: Final = np.dtype(QuietState)
+"""QuietState as a numpy type, for compiled code."""
