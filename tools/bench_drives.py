@@ -1,9 +1,12 @@
 """Simulated drives on a bus between processes, to which other programs can listen to measure the loop's frames.
 
-python tools/bench_drives.py CONFIG PATH [TIMES]    real-time if permitted, away from the loop's processor
+python tools/bench_drives.py CONFIG PATH PROCESSOR [TIMES]
 
-At SIGTERM, the times at which SYNCs arrived are written to the file TIMES, as 64-bit floats in seconds. The drives note
-them because they have real-time priority; the kernel stamps a frame between processes only when it is read.
+The drives run on PROCESSOR, which must not be the loop's. Without TIMES, they sleep until a frame arrives, and have
+real-time priority if permitted. With TIMES, they poll for frames all the time, as the hardware of a CAN controller
+does, and they write the times at which SYNCs arrived to the file TIMES at SIGTERM, as 64-bit floats in seconds. If they
+slept, the times would include their own wake-up, which takes longer than all that a sender does. The kernel does not
+stamp a frame between processes.
 
 tools/virtual_drives.py is the version for users: it accepts faults and reports the drives' states.
 """
@@ -13,10 +16,12 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import select
 import signal
 import sys
 import time
 from array import array
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -30,33 +35,51 @@ PRIORITY = 75
 planner's own priority, frames waited for the planner: 700 µs at each goal."""
 POLL = 0.01
 """Interval at which the drives' timers are polled while no frame arrives [s]."""
+MAX_POLLS = 5_000
+"""Number of polls without a frame after which the drives' timers are polled; a few milliseconds."""
 
 
 def main() -> None:
     """Run the drives until SIGTERM."""
     config = load(Path(sys.argv[1]))
     signal.signal(signal.SIGTERM, _end)
+    times = Path(sys.argv[4]) if len(sys.argv) > 4 else None
     with contextlib.suppress(OSError):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setaffinity(0, {int(sys.argv[3])})
+        if times is None:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        else:
+            os.nice(-20)  # a real-time process that never sleeps would be throttled
     with UnixBus(sys.argv[2], listen=True) as wire, simulated_bus(config.can, config.drives) as drives:
         gc.collect()
         gc.freeze()
         gc.disable()
-        syncs = array("d")
+        syncs, polled = array("d"), select.poll()
+        polled.register(wire.fileno(), select.POLLIN)
+        polls = times is not None and (os.cpu_count() or 1) > 1
+        wait = partial(_busy_poll, polled) if polls else partial(polled.poll, POLL * 1000.0)
         print("ready", flush=True)
         try:
             while True:
-                frame = wire.recv(POLL)
-                if frame is not None:
+                wait()
+                arrived = time.monotonic()
+                while (frame := wire.recv(0.0)) is not None:
                     if frame.arbitration_id == SYNC:
-                        syncs.append(time.monotonic())
+                        syncs.append(arrived)
                     drives.send(frame)
+                    arrived = time.monotonic()
                 while (answer := drives.recv(0.0)) is not None:
                     wire.send(answer)
         finally:
-            if len(sys.argv) > 3:
-                Path(sys.argv[3]).write_bytes(syncs.tobytes())
+            if times is not None:
+                times.write_bytes(syncs.tobytes())
+
+
+def _busy_poll(polled: select.poll) -> None:
+    """Poll for a frame without sleeping, at most MAX_POLLS times."""
+    for _ in range(MAX_POLLS):
+        if polled.poll(0):
+            return
 
 
 def _end(_signal: int, _frame: FrameType | None) -> None:

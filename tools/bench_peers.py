@@ -1,28 +1,30 @@
 """Intervals of SYNC at the drives: trirail's loop, python-canopen's SYNC, LinuxCNC's servo thread, and the machine.
 
 trirail and python-canopen send over the same bus between processes to the same drives, which note when each SYNC
-arrives. An arrival includes the wake-up of the drives' process, which a CAN controller does not need. A bare compiled
-loop, which only sends SYNC and setpoints, shows how much of the deviation that is: no sender can be better here.
-python-canopen runs unchanged, with the loop's privileges, and with setpoints. LinuxCNC's servo thread drives no drives,
-so its intervals are those of its own clock. The machine's own lateness is measured before and after them, with the same
-priority on the same processor.
+arrives. The drives have a processor for themselves, on which they poll for frames all the time, since their own wake-up
+would hide the deviations. A bare compiled loop, which sleeps until each deadline and only sends SYNC and setpoints,
+shows what a wake-up costs. trirail wakes up earlier (`loop.busy_wait`). python-canopen runs unchanged, with the loop's
+privileges, and with setpoints. LinuxCNC's servo thread drives no drives, so its intervals are those of its own clock.
+The machine's own lateness is measured before and after them, with the same priority on the same processor.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import bench_linuxcnc
 import numpy as np
 from bench_beside import Beside
-from bench_rig import QUANTILES, configured, drives, quantiles, rig, without_pause
+from bench_rig import PROCESSORS, QUANTILES, configured, drives, quantiles, rig, without_pause
 from trirail.diagnosis.bare_loop import BareBus, prepare
 from trirail.processes.clock import Ticker
 from trirail_drivers.bus.frames import Frame
@@ -40,18 +42,19 @@ def measure(seconds: float) -> dict[str, Any]:
     `machine_us` is the machine's own share: the deviation of a wake-up's lateness from its median, in runs before and
     after the others. `ratio` compares trirail's deviation with the larger of the two.
     """
-    before = _machine(seconds)
-    deviations = {
-        "trirail, moving": _trirail(seconds),
-        "a bare compiled loop": _sent(seconds, "bare"),
-        "python-canopen": _sent(seconds, "its own thread"),
-        "python-canopen, SCHED_FIFO": _sent(seconds, "real time"),
-        "python-canopen, SCHED_FIFO, with setpoints": _sent(seconds, "setpoints"),
-    }
-    linuxcnc = _linuxcnc(seconds)
-    if not isinstance(linuxcnc, str):
-        deviations["LinuxCNC's servo thread, without drives"] = linuxcnc
-    after = _machine(seconds)
+    with _away_from_the_drives():
+        before = _machine(seconds)
+        deviations = {
+            "trirail, moving": _trirail(seconds),
+            "a bare compiled loop": _sent(seconds, "bare"),
+            "python-canopen": _sent(seconds, "its own thread"),
+            "python-canopen, SCHED_FIFO": _sent(seconds, "real time"),
+            "python-canopen, SCHED_FIFO, with setpoints": _sent(seconds, "setpoints"),
+        }
+        linuxcnc = _linuxcnc(seconds)
+        if not isinstance(linuxcnc, str):
+            deviations["LinuxCNC's servo thread, without drives"] = linuxcnc
+        after = _machine(seconds)
     machine = [max(pair) for pair in zip(before, after, strict=True)]
     return {
         "rate_hz": RATE,
@@ -62,6 +65,17 @@ def measure(seconds: float) -> dict[str, Any]:
         "ratio_to_bare": _ratios(deviations["trirail, moving"], deviations["a bare compiled loop"]),
         "linuxcnc": linuxcnc if isinstance(linuxcnc, str) else "",
     }
+
+
+@contextlib.contextmanager
+def _away_from_the_drives() -> Iterator[None]:
+    """Keep this process, and the processes that it starts, off the drives' processor, if there is another one."""
+    others = set(PROCESSORS[1:]) or set(PROCESSORS)
+    os.sched_setaffinity(0, others)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, PROCESSORS)
 
 
 def _ratios(ours: list[float], others: list[float]) -> list[float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import random
 import re
 import subprocess
@@ -27,6 +28,8 @@ BITRATE = 8_000_000
 """Bit rate of the virtual bus [bit/s], so high that the bus load does not limit the measured rates."""
 
 
+PROCESSORS = sorted(os.sched_getaffinity(0))
+"""Processors of the benchmarks. The drives on a bus run on the first, and the loop on the last."""
 QUANTILES = (50.0, 99.0, 99.9, 100.0)
 
 
@@ -86,7 +89,8 @@ def configured(folder: Path, rate_hz: int, own: bool) -> tuple[Path, str]:
 @contextlib.contextmanager
 def drives(config: Path, bus: str, times: Path | None = None) -> Iterator[None]:
     """Run the drives of a configuration in a separate process, which writes the arrivals of SYNC to `times`."""
-    command = [sys.executable, str(Path(__file__).with_name("bench_drives.py")), str(config), bus]
+    program = Path(__file__).with_name("bench_drives.py")
+    command = [sys.executable, str(program), str(config), bus, str(PROCESSORS[0])]
     if times is not None:
         command.append(str(times))
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
+
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes.clock import Ticker
+from trirail.processes.clock import Ticker, busy_wait, sleep_until
 
 PERIOD = 1_000_000
 
@@ -31,6 +34,26 @@ def test_deadlines_do_not_drift() -> None:
     assert [tick.deadline_ns for tick in ticks] == [123 + (i + 1) * PERIOD for i in range(1000)]
     assert {tick.lateness_ns for tick in ticks} == {70_000}
     assert not any(tick.missed for tick in ticks)
+
+
+@given(early=st.integers(-3 * PERIOD, 3 * PERIOD))
+def test_a_tick_that_is_not_due_yet_is_waited_for(early: int) -> None:
+    clock = Clock()
+    ticker = Ticker(PERIOD, clock.now, clock.sleep)
+    ticker.deadline_ns = clock.time + early
+    tick = ticker.tick()
+    assert clock.time == max(clock.time, tick.deadline_ns)
+    assert tick.missed * PERIOD + tick.lateness_ns == max(0, -early)
+
+
+@given(busy=st.sampled_from([0, 20_000, 50_000, 100_000]), ahead=st.integers(-1_000_000, 1_000_000))
+def test_nobody_who_waits_wakes_up_early(busy: int, ahead: int) -> None:
+    deadline = time.monotonic_ns() + ahead
+    sleep_until(deadline, busy)
+    assert time.monotonic_ns() >= deadline
+    deadline += abs(ahead) // 4
+    assert busy_wait(deadline, np.zeros(2, np.int64)) >= deadline
+    assert time.monotonic_ns() >= deadline
 
 
 @given(st.lists(st.integers(0, 20 * PERIOD), min_size=1, max_size=200))

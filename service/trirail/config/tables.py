@@ -256,6 +256,14 @@ class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Priority of the loop among SCHED_FIFO threads."""
     cpu: Annotated[int, Meta(ge=0, le=8191)] | None = None
     """Processor to which the loop is pinned. If absent, it is the last one that the process may use."""
+    busy_wait: Annotated[float, Meta(ge=0.0, le=1e-4)] = 5e-5
+    """Time before each tick at which the loop wakes up [s]. It reads the frames that have arrived, and then the clock
+    until the tick is due, so that SYNC leaves within microseconds of its time. Not used with `realtime = "off"`."""
+
+    @property
+    def busy_wait_ns(self) -> int:
+        """Time before each tick at which the loop wakes up [ns]."""
+        return 0 if self.realtime == "off" else round(self.busy_wait * 1e9)
 
 
 class Tls(Struct, frozen=True, forbid_unknown_fields=True):

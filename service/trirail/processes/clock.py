@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -50,6 +51,18 @@ def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
     moment[0], moment[1] = deadline_ns // _SECOND, deadline_ns % _SECOND
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, moment.ctypes.data, 0) == _INTERRUPTED:
         pass
+
+
+@compiled()
+def busy_wait(deadline_ns: int, moment: NDArray[np.int64]) -> int:
+    """Read the clock until the deadline, and return the time [ns]; `moment` is the same as for `now_ns`.
+
+    A thread that sleeps until the deadline wakes up some 20 µs late, and not always by the same time.
+    """
+    now = now_ns(moment)
+    while now < deadline_ns:
+        now = now_ns(moment)
+    return int(now)
 
 
 @compiled(b1(POLLFDS))
@@ -145,11 +158,13 @@ class Overruns:
         return in_a_row if in_a_row > self.allowed else 0
 
 
-def sleep_until(deadline_ns: int) -> None:
-    """Sleep until an absolute time of the monotonic clock [ns]."""
-    remaining = deadline_ns - time.monotonic_ns()
+def sleep_until(deadline_ns: int, busy_wait_ns: int = 0) -> None:
+    """Sleep until an absolute time of the monotonic clock [ns], but read the clock for the last `busy_wait_ns`."""
+    remaining = deadline_ns - busy_wait_ns - time.monotonic_ns()
     if remaining > 0:
         time.sleep(remaining * 1e-9)  # CPython converts this to an absolute deadline: clock_nanosleep, TIMER_ABSTIME
+    while time.monotonic_ns() < deadline_ns:
+        pass
 
 
 class Ticker:
@@ -159,11 +174,13 @@ class Ticker:
         self,
         period_ns: int,
         now: Callable[[], int] = time.monotonic_ns,
-        sleep: Callable[[int], None] = sleep_until,
+        sleep: Callable[[int], None] | None = None,
+        busy_wait_ns: int = 0,
     ) -> None:
         self._period_ns = period_ns
         self._now = now
-        self._sleep = sleep
+        self._busy_wait_ns = busy_wait_ns
+        self._sleep = sleep or partial(sleep_until, busy_wait_ns=busy_wait_ns)
         self.deadline_ns = now()
         """Time at which the newest tick was due [ns]."""
 
@@ -180,7 +197,7 @@ class Ticker:
     def listen(self, poll_set: PollSet) -> bool:
         """Wait for the next deadline or for an early call. Return True if there is a call."""
         if self._now is time.monotonic_ns:
-            return poll_set.wait(self.deadline_ns + self._period_ns)
+            return poll_set.wait(self.deadline_ns + self._period_ns - self._busy_wait_ns)
         self._sleep_to_next()
         return poll_set.called()
 
@@ -196,7 +213,9 @@ class Ticker:
             self._sleep(self.deadline_ns + self._period_ns)
 
     def tick(self) -> Tick:
-        """Return the tick that is due, after the caller has waited for it."""
+        """Return the tick that is due, once it is due."""
+        if self._now() < self.deadline_ns:
+            self._sleep(self.deadline_ns)
         lateness_ns = self._now() - self.deadline_ns
         missed = max(0, lateness_ns // self._period_ns)
         self.deadline_ns += missed * self._period_ns

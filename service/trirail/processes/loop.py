@@ -118,7 +118,7 @@ class Loop:
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
             beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
-            self._quiet = QuietCycles(self.control, drives, *beside)
+            self._quiet = QuietCycles(self.control, drives, *beside, config.loop.busy_wait_ns)
         self._fault: DriveFault | None = None
         self._unready: tuple[str, ...] = ()
         self._marked_ns = 0

@@ -234,7 +234,7 @@ def main(
 
         signal.signal(signal.SIGTERM, end)
         ready({"lacking": lacking, "bus_load": drives.bus_load})
-        loop.run(Ticker(round(config.period * 1e9)))
+        loop.run(Ticker(round(config.period * 1e9), busy_wait_ns=config.loop.busy_wait_ns))
         ended_normally = True
     finally:
         heartbeats.heart("loop").rest()  # closing the drives may take longer than the time-out of the heartbeat

@@ -24,7 +24,7 @@ from trirail_drivers.driver.cyclic import MOST_FRAMES
 from trirail.control import cycle, outputs
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
-from trirail.processes.clock import POLLFDS, SPARE_NS, called, now_ns, sleep, wait
+from trirail.processes.clock import POLLFDS, SPARE_NS, busy_wait, called, now_ns, sleep, wait
 from trirail.processes.cycle_frames import (
     AXES,
     EXPECTATIONS,
@@ -184,13 +184,21 @@ def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
 
 @compiled()
 def _wait(state: NDArray[np.void], moment: NDArray[np.int64], pollfds: NDArray[np.int32]) -> bool:
-    """Wait for the deadline. Return True if a neighbour has called and the call must be served before the deadline."""
+    """Wait until shortly before the deadline. Return True if a neighbour has called and must be served before it."""
     if state[0].injected_ns >= 0:
         return bool(state[0].listens and called(pollfds))
+    wake_ns = state[0].deadline_ns - state[0].busy_wait_ns
     if state[0].listens:
-        return bool(wait(state[0].deadline_ns, pollfds, moment))
-    sleep(state[0].deadline_ns, moment)
+        return bool(wait(wake_ns, pollfds, moment))
+    sleep(wake_ns, moment)
     return False
+
+
+@compiled()
+def _busy_wait(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
+    if state[0].injected_ns >= 0:
+        return int(state[0].injected_ns)
+    return int(busy_wait(state[0].deadline_ns, moment))
 
 
 @compiled()
@@ -218,14 +226,15 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
         s.deadline_ns -= s.period_ns
         s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
         return Reached.CALLED
-    now, s.listens = _now_ns(state, moment), s.period_ns > SPARE_NS
-    s.marked_ns, s.handled, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0, False
+    s.listens, s.sent, s.called = s.period_ns > SPARE_NS, 0, False
+    # The frames that have arrived answer the previous SYNC. Nothing is left to do between the deadline and SYNC.
+    if not _receive(s, moment, frames, _now_ns(state, moment) / 1e9):
+        return Reached.WAITED
+    s.marked_ns = now = _busy_wait(state, moment)
     s.lateness_ns = now - s.deadline_ns
     s.missed = max(0, s.lateness_ns // s.period_ns)
     t = now / 1e9
     if (s.missed and s.in_a_row + s.missed > s.allowed) or t >= times[0].due:
-        return Reached.WAITED
-    if not _receive(s, moment, frames, t):
         return Reached.WAITED
     s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
     s.synced, s.handled, s.arrived = t, 0, 0

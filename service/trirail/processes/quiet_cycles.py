@@ -61,6 +61,7 @@ class QuietCycles:
         poll_set: PollSet,
         watch: Watch,
         urgent_flag: UrgentFlag,
+        busy_wait_ns: int,
     ) -> None:
         self.cycles = 0
         """Number of cycles that the compiled function has run."""
@@ -91,7 +92,7 @@ class QuietCycles:
         state.period, state.period_ns, state.injected_ns = control.period, round(control.period * 1e9), -1
         state.fastest, state.limit, state.step = measured.fastest, measured.limit, setpoints.step
         state.gateway_place, state.gateway_patience = PROCESSES.index("gateway"), watch.patience
-        state.report_after = control.outputs.report_after
+        state.report_after, state.busy_wait_ns = control.outputs.report_after, busy_wait_ns
 
     def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool, once: bool) -> QuietResult | None:
         """Run cycles until an event or the end of a batch, and return the result for the newest cycle.

@@ -28,6 +28,8 @@ class QuietState(ctypes.Structure):
     """Period of the loop [s]."""
     injected_ns: int
     """Time of an injected clock in tests; negative to use the monotonic clock."""
+    busy_wait_ns: int
+    """Time before each deadline at which the loop wakes up."""
     deadline_ns: int
     """Time at which the newest tick was due."""
     lateness_ns: int
