@@ -194,7 +194,7 @@ def test_an_offset_that_does_not_fit_is_refused_with_the_way_out(closing: Closin
     with pytest.raises(
         BusError,
         match=r"^1250 Hz takes 110% of the bus at 850000 bit/s; the highest rate that fits is 1134 Hz; "
-        r'drives\.velocity_offset = "auto" uses 92 % or CAN FD \(can\.fd = true\), if the drives and the adapter have '
+        r'drives\.velocity_offset = "auto" uses 92 %, or CAN FD \(can\.fd = true\), if the drives and the adapter have '
         r"it, uses 49 %$",
     ):
         rig.drives.configure(1.0 / FAST)

@@ -233,7 +233,7 @@ def plan_traffic(drives: Drives, io: Sequence[DigitalIo], rate_hz: float, timing
         plan = TrafficPlan(full)
     else:
         plan = TrafficPlan(short, 4, velocity_offset=False, full_load=load)
-    return plan._replace(remedy=" or ".join(_remedies(plan.traffic, short, rate_hz, timing, drives.heartbeat)))
+    return plan._replace(remedy=", or ".join(_remedies(plan.traffic, short, rate_hz, timing, drives.heartbeat)))
 
 
 def _remedies(used: Traffic, short: Traffic, rate_hz: float, timing: BusTiming, heartbeat: float) -> Iterator[str]:

@@ -226,7 +226,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
         s.deadline_ns -= s.period_ns
         s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
         return Reached.CALLED
-    s.listens, s.sent, s.called = s.period_ns > SPARE_NS, 0, False
+    s.listens, s.sent, s.called = s.period_ns > SPARE_NS, 0, called(neighbours.pollfds)
     # The frames that have arrived answer the previous SYNC. Nothing is left to do between the deadline and SYNC.
     if not _receive(s, moment, frames, _now_ns(state, moment) / 1e9):
         return Reached.WAITED
@@ -263,7 +263,6 @@ def _read(
 ) -> int:
     """Read the drives' answers into `feedback`. Return CONTINUE, or the reached stage if Python must do it."""
     s, pollfds, hearts, axes = state[0], neighbours.pollfds, neighbours.hearts, frames.axes
-    s.called = called(pollfds)
     count = hearts[s.gateway_place]  # the same check as in trirail.processes.heartbeats.Watch
     turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
     if hearts[URGENT_INDEX] != s.urgent_seen or pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience:
