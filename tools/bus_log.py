@@ -64,6 +64,8 @@ ASKED_BY = {
 
 GRID_TOLERANCE = 1e-3
 """Rounding of timestamps and of the grid of ticks, as a fraction of the period."""
+STALLED = 100
+"""One SYNC in this number may be late by more than half a period, because the machine stalled."""
 
 ALLOWED_PREDECESSORS = {0x07: {0x06, 0x0F}, 0x0F: {0x07}}
 """Controlwords that may precede each of these controlwords during a power-up."""
@@ -192,8 +194,9 @@ def gap_problems(log: Sequence[Frame], period: float, timing: BusTiming, master:
     """Yield the service's frames that are sent in the frame time before a tick, or after it and before its SYNC.
 
     Such a frame can still be on the bus at the time of the SYNC, and would delay it. The ticks are not in the log: each
-    SYNC is late by an unknown time, so the grid of the period begins with the SYNC that is earliest in its period. A
-    cycle with setpoints that are sent so late is late as a whole, and the service counts its setpoints.
+    SYNC is late by an unknown time, so the grid of the period begins with the SYNC that is earliest in its period,
+    except for one in STALLED: a SYNC that is late by more than half a period seems to be early. A cycle with setpoints
+    that are sent so late is late as a whole, and the service counts its setpoints.
 
     Parameters
     ----------
@@ -209,7 +212,8 @@ def gap_problems(log: Sequence[Frame], period: float, timing: BusTiming, master:
     if not syncs:
         return
     began = syncs[0]
-    began += min(t - began - round((t - began) / period) * period for t in syncs)
+    offsets = sorted(t - began - round((t - began) / period) * period for t in syncs)
+    began += offsets[len(offsets) // STALLED]
     frame_time = timing.frame_ns(8) * 1e-9
     for cycle in _cycles(log):
         number = math.floor((cycle[0].t - began) / period + GRID_TOLERANCE)

@@ -8,6 +8,8 @@ from pathlib import Path
 import bus_log
 import pytest
 from bus_log import Frame
+from hypothesis import given
+from hypothesis import strategies as st
 from trirail.config import SIM, load
 from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.timing import BusTiming
@@ -200,6 +202,21 @@ def test_a_late_tick_excuses_no_frame_before_its_sync() -> None:
     log = [*delayed(3e-4), Frame(BEFORE + 1e-4, layout.SDO_REQUEST + 1, layout.STATUSWORD_UPLOAD)]
     assert len(gaps(sorted(log, key=lambda frame: frame.t))) == 1
     assert gaps(delayed(3e-4)) == []
+
+
+@given(late=st.floats(0.0, 0.95), stalled=st.integers(21, 378))
+def test_one_stall_of_the_machine_moves_no_tick(late: float, stalled: int) -> None:
+    """Not even by more than half a period, with which a SYNC seems to be early."""
+    begins = 1.0 + stalled * PERIOD
+    log = [
+        frame._replace(t=frame.t + late * PERIOD) if begins - 1e-9 < frame.t < begins + PERIOD / 2 else frame
+        for frame in GOOD
+    ]
+    for cycle in range(0, 400, 10):
+        if cycle != stalled:
+            request = Frame(1.0 + (cycle + 0.6) * PERIOD, layout.SDO_REQUEST + 1, layout.STATUSWORD_UPLOAD)
+            log.append(request)
+    assert gaps(sorted(log, key=lambda frame: frame.t)) == []
 
 
 def test_a_cycle_with_late_setpoints_is_no_gap_that_was_missed() -> None:
