@@ -30,6 +30,7 @@ class Beside:
     def __init__(self, seconds: float, period_us: int, priority: int, result: Path) -> None:
         self.period_us = period_us
         self._result = result
+        self._seconds = seconds
         self.name = "cyclictest" if shutil.which("cyclictest") and os.geteuid() == 0 else "a loop that only sleeps"
         processor = max(os.sched_getaffinity(0))
         if self.name == "cyclictest":
@@ -42,7 +43,7 @@ class Beside:
 
     def lateness(self) -> NDArray[np.float64]:
         """Wait for the end of the measurement; return the lateness of each wake-up [µs]."""
-        self._process.wait(60)
+        self._process.wait(self._seconds + 60.0)
         result = json.loads(self._result.read_text(encoding="utf-8"))
         counts = result["thread"]["0"]["histogram"] if "thread" in result else result
         return np.repeat([float(value) for value in counts], list(counts.values()))
