@@ -107,6 +107,7 @@ def config(recording: Recording) -> Config:
 
 def test_the_recording_is_whole(recording: Recording) -> None:
     assert np.array_equal(recording.records["cycle"], np.arange(1, len(recording.records) + 1))
+    assert recording.records["lateness_ns"].min() >= 0, "no SYNC leaves before its tick"
     assert [what.seq for what in recording.requests] == list(range(1, len(recording.requests) + 1))
     kinds = {type(what.given) for what in recording.requests}
     assert {GoalRequest, CheckRequest, CommandRequest, Disturbance} <= kinds

@@ -337,6 +337,32 @@ def test_on_a_slow_machine_only_the_first_report_makes_a_cycle_late(
     assert sum(event.outcome == "preempted" for event in shell.events()) == 10
 
 
+@pytest.mark.parametrize("last_took_ns", [200_000, 700_000])
+def test_a_request_waits_a_cycle_where_the_last_one_took_longer_than_the_time_left(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, last_took_ns: int
+) -> None:
+    shell.enabled()
+    decide = shell.loop.control.decide
+
+    def slow_decide(inputs: Iterable[TimedInput]) -> None:
+        inputs = list(inputs)
+        decide(inputs)
+        shell.took_ns += last_took_ns if inputs else 0
+
+    monkeypatch.setattr(shell.loop.control, "decide", slow_decide)
+    shell.send(2, "g-1", PoseGoal(0.01, 0.0, 0.0))
+    for _ in range(5):
+        shell.took_ns = 0
+        shell.cycles(1)
+    shell.took_ns = 500_000
+    shell.send(3, "g-2", PoseGoal(0.02, 0.0, 0.0))
+    shell.cycles(1)
+    assert shell.loop._gateway.postponed == (last_took_ns > 500_000)
+    shell.took_ns = 0
+    shell.cycles(1)
+    assert not shell.loop._gateway.postponed
+
+
 def test_a_machine_that_stands_still_is_no_frozen_gateway(shell: Shell) -> None:
     moving(shell)
     shell.rig.now += 0.09

@@ -1,11 +1,11 @@
 """Compiled call that runs cycles without events ("quiet" cycles), one after the other, until Python is needed.
 
-In each cycle, the call waits for the tick, sends the SYNC, receives frames and calls `observe`. It then calls
-`command`, `hold` or `follow`, applies the last gate to the setpoints, and writes setpoints and record. The call makes
-no decisions. Some decisions must be made before the setpoints are sent: if a drive sends anything other than its
-position, a request is urgent, a neighbour has disconnected, or the last gate refuses a setpoint. In these cases the
-call returns at the stage that it has reached, and Python continues from there. If other work is due, the call returns
-after the setpoints have been sent.
+In each cycle, the call wakes up shortly before the tick, receives the frames that answer the previous SYNC, and waits
+for the tick. It sends the SYNC, receives frames and calls `observe`. It then calls `command`, `hold` or `follow`,
+applies the last gate to the setpoints, and writes setpoints and record. The call makes no decisions. Some decisions
+must be made before the setpoints are sent: if a drive sends anything other than its position, a request is urgent, a
+neighbour has disconnected, or the last gate refuses a setpoint. In these cases the call returns at the stage that it
+has reached, and Python continues from there. If other work is due, the call returns after the setpoints have been sent.
 
 A signal does not end a wait. Python's signal handlers run when the call has returned, which is at the end of a batch of
 records at the latest.
@@ -51,7 +51,7 @@ class Reached(IntEnum):
     """Stage that the newest cycle has reached when the compiled call returns."""
 
     WAITED = 0
-    """The tick is due. Frames may have been received before the SYNC."""
+    """The tick is due, or will be shortly. Frames may have been received before the SYNC."""
     SYNCED = 1
     """The SYNC has been sent, as far as the bus has accepted it. Frames may have been received."""
     OBSERVED = 2

@@ -1,0 +1,131 @@
+"""What every cycle does to a drive's row, against drives of which it is known when they sampled what they say.
+
+Python and compiled cycles share these functions, so a comparison of the two does not show a mistake in them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from control_rig import CONFIG
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.row_updates import (
+    accept_answer,
+    accept_counts,
+    accept_turns,
+    answered_sync,
+    count_sync,
+    end_reading,
+    is_late,
+)
+from trirail_drivers.driver.scaling import Scale
+
+Arrival = Literal["before the read", "after the read", "after the next SYNC", "never"]
+"""When the answer to a SYNC arrives."""
+
+
+def made(counts_per_metre: float = 1e6, offset: float = 0.01) -> Axis:
+    return Axis("A", 1, Scale(counts_per_metre, offset), CONFIG.drives)
+
+
+def run(arrivals: list[Arrival]) -> Axis:
+    """Answer each SYNC when it is said; check that each answer is taken for that to its own SYNC."""
+    axis, overdue, came, answered = made(), False, False, 0
+    for number, arrival in enumerate(arrivals, 1):
+        count_sync(axis)
+        assert axis.syncs == axis.command_age == number
+        if overdue:
+            axis.answer()
+            assert axis.sampled == number - 1
+            answered = number - 1
+        if arrival == "before the read":
+            axis.answer()
+        assert axis.came == (came or overdue or arrival == "before the read")
+        end_reading(axis)
+        assert axis.between
+        assert not axis.came
+        if arrival == "after the read":
+            axis.answer()
+        if arrival in ("before the read", "after the read"):
+            assert (axis.sampled, axis.age) == (number, 0)
+            assert axis.prompt == (arrival == "before the read")
+            answered = number
+        overdue, came = arrival == "after the next SYNC", arrival == "after the read"
+        assert axis.sampled == answered
+    return axis
+
+
+def lost(arrivals: list[Arrival]) -> int:
+    """How many SYNCs before the last one that was answered were not."""
+    answered = [number for number, arrival in enumerate(arrivals) if arrival != "never"]
+    return arrivals[: answered[-1]].count("never") if answered else 0
+
+
+@given(st.lists(st.sampled_from(["before the read", "never"])))
+def test_a_quick_drive_answers_the_newest_sync_whatever_got_lost(arrivals: list[Arrival]) -> None:
+    """Once it has answered: before, nothing tells a quick drive from one whose answer is overdue."""
+    axis = run(["before the read", *arrivals])
+    assert (axis.late, axis.lost) == (0, lost(["before the read", *arrivals]))
+
+
+@given(st.lists(st.sampled_from(["after the read", "after the next SYNC", "never"])))
+def test_a_drive_as_on_a_real_bus_answers_its_own_sync_also_when_the_answer_is_overdue(arrivals: list[Arrival]) -> None:
+    axis = run([*arrivals, "after the read"])
+    assert (axis.late, axis.lost) == (0, lost([*arrivals, "after the read"]))
+
+
+@given(before=st.integers(1, 5), after=st.integers(1, 5))
+def test_an_answer_is_late_once_where_it_comes_later_in_its_cycle_than_the_one_before(before: int, after: int) -> None:
+    axis = run(["before the read"] * before + ["after the read"] * after)
+    assert (axis.late, axis.lost) == (1, 0)
+
+
+def test_a_second_answer_to_a_sync_is_not_late() -> None:
+    axis = run(["before the read"])
+    assert answered_sync(axis) == 1
+    assert not is_late(axis, 1)
+    axis.answer()
+    assert (axis.sampled, axis.late, axis.lost) == (1, 0, 0)
+
+
+def test_an_answer_to_the_sync_before_is_not_prompt() -> None:
+    axis = made()
+    count_sync(axis)
+    count_sync(axis)
+    accept_answer(axis, 1)
+    assert (axis.came, axis.sampled, axis.prompt) == (True, 1, False)
+
+
+@given(st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1), st.floats(0.5, 1e4))
+def test_positions_are_kept_with_the_last_step_and_since_when_the_slider_stands(
+    positions: list[int], still: float
+) -> None:
+    axis = made(-2e5, 0.3)
+    axis.still, axis.stands_since = still, math.inf
+    stands_at, since, steps, before = axis.stands_at, math.inf, [axis.step], axis.newest
+    for now, counts in enumerate(positions):
+        accept_counts(axis, counts, float(now))
+        if abs(counts - stands_at) > still:
+            stands_at, since = counts, float(now)
+        since = min(since, float(now))
+        steps += [counts - before] if counts != before else []
+        before = counts
+        assert (axis.newest, axis.actual, axis.position) == (counts, counts, counts / -2e5 + 0.3)
+        assert (axis.stands_at, axis.stands_since, axis.step) == (stands_at, since, steps[-1])
+
+
+def test_a_slider_that_moved_just_as_far_as_allowed_still_stands() -> None:
+    axis = made()
+    axis.still, axis.stands_since = 10.0, math.inf
+    for now, counts in enumerate((0, 10, -10, 11)):
+        accept_counts(axis, counts, float(now))
+        assert axis.stands_since == (0.0 if counts != 11 else 3.0)
+
+
+def test_turns_become_metres() -> None:
+    axis = made(25.0, -0.1)
+    accept_turns(axis, 5.0)
+    assert axis.position == 0.1
