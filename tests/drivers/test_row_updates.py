@@ -6,7 +6,7 @@ Python and compiled cycles share these functions, so a comparison of the two doe
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, cast
 
 from control_rig import CONFIG
 from hypothesis import given
@@ -79,7 +79,8 @@ def test_a_drive_as_on_a_real_bus_answers_its_own_sync_also_when_the_answer_is_o
 
 @given(before=st.integers(1, 5), after=st.integers(1, 5))
 def test_an_answer_is_late_once_where_it_comes_later_in_its_cycle_than_the_one_before(before: int, after: int) -> None:
-    axis = run(["before the read"] * before + ["after the read"] * after)
+    prompt, overdue = cast(list[Arrival], ["before the read"]), cast(list[Arrival], ["after the read"])
+    axis = run(prompt * before + overdue * after)
     assert (axis.late, axis.lost) == (1, 0)
 
 
