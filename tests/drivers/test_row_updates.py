@@ -8,18 +8,27 @@ from __future__ import annotations
 import math
 from typing import Literal, cast
 
+import numpy as np
 from control_rig import CONFIG
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from trirail_drivers.bus.can_frame import DATA_AT
+from trirail_drivers.cia402 import process_data
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.row_updates import (
     accept_answer,
     accept_counts,
+    accept_statusword,
     accept_turns,
     answered_sync,
     count_sync,
+    due_setpoint,
     end_reading,
     is_late,
+    outputs_pending,
+    put_outputs,
+    put_setpoint,
+    scale_setpoint,
 )
 from trirail_drivers.driver.scaling import Scale
 
@@ -75,6 +84,68 @@ def test_a_quick_drive_answers_the_newest_sync_whatever_got_lost(arrivals: list[
 def test_a_drive_as_on_a_real_bus_answers_its_own_sync_also_when_the_answer_is_overdue(arrivals: list[Arrival]) -> None:
     axis = run([*arrivals, "after the read"])
     assert (axis.late, axis.lost) == (0, lost([*arrivals, "after the read"]))
+
+
+EDGES = [edge * 1e-6 for edge in (-(2**31) - 1, -(2**31), 2**31 - 1, 2**31)]
+ENTRIES = (process_data.TARGET_POSITION, process_data.VELOCITY_OFFSET, process_data.CONTROLWORD)
+
+
+@given(
+    entries=st.permutations(ENTRIES).flatmap(lambda order: st.sampled_from([order[:2], order[:1]])),
+    position=st.floats(-3000.0, 3000.0) | st.sampled_from(EDGES),
+    velocity=st.floats(-3000.0, 3000.0) | st.sampled_from(EDGES),
+    controlword=st.integers(0, 0xFFFF),
+)
+def test_a_setpoint_is_in_its_frame_as_struct_packs_it_or_is_refused_whole(
+    entries: list[int], position: float, velocity: float, controlword: int
+) -> None:
+    assume(process_data.TARGET_POSITION in entries)
+    axis, pdo = made(offset=0.0), process_data.SetpointPdo(0x301, tuple(entries))
+    axis.position_at, axis.velocity_at, axis.controlword_at = map(pdo.offset, range(3))
+    axis.velocity_per_metre, axis.velocity_step, axis.velocity_bytes = 2e6, 2.0, 4
+    axis.controlword, axis.target, axis.offset = controlword, 1.0, 2
+    counts, speed = round(position * 1e6), round(velocity * 1e6)
+    within = range(-(1 << 31), 1 << 31)
+    fits = counts in within and (speed in within or not pdo.has_velocity)
+    assert scale_setpoint(axis, position, velocity) == fits
+    frame, data = pdo.frame(), np.zeros(8, np.uint8)
+    if not fits:
+        assert (axis.target, axis.offset) == (1.0, 2)
+        return
+    put_setpoint(axis, data)
+    pdo.fill(frame, counts, speed if pdo.has_velocity else 0, controlword)
+    assert data.tobytes() == bytes(frame.packed[DATA_AT:]).ljust(8, b"\0")
+
+
+@given(sampled_ago=st.integers(0, 9), syncs=st.integers(9, 30), length=st.integers(1, 6))
+def test_a_position_is_compared_with_what_was_commanded_at_its_sync(sampled_ago: int, syncs: int, length: int) -> None:
+    axis, commanded = made(), np.full(length, np.nan)
+    for number in range(syncs + 1):
+        commanded[number % length] = number
+    axis.syncs, axis.sampled = syncs, syncs - sampled_ago
+    assert due_setpoint(axis, commanded) == syncs - min(sampled_ago, length - 1)
+
+
+@given(wanted=st.integers(0, 0xFFFF_FFFF), kept=st.integers(0, 0xFFFF_FFFF))
+def test_outputs_leave_the_ones_that_nobody_uses_as_they_were(wanted: int, kept: int) -> None:
+    axis, data = made(), np.zeros(4, np.uint8)
+    axis.outputs, axis.outputs_kept = wanted, kept
+    assert not outputs_pending(axis)
+    axis.has_outputs = True
+    assert outputs_pending(axis) == (wanted != 0)
+    axis.outputs_sent = wanted
+    assert not outputs_pending(axis)
+    put_outputs(axis, data)
+    assert data.tobytes() == (wanted | kept).to_bytes(4, "little")
+
+
+@given(before=st.integers(1, 0xFFFF), after=st.integers(0, 0xFFFF))
+def test_bits_that_were_clear_once_are_remembered(before: int, after: int) -> None:
+    axis = made()
+    accept_statusword(axis, before, 1.0)
+    accept_statusword(axis, after, 2.0)
+    assert (axis.statusword, axis.status_heard) == (after, 2.0)
+    assert axis.seen_clear & 0xFFFF == 0xFFFF & ~(before & after)
 
 
 @given(before=st.integers(1, 5), after=st.integers(1, 5))

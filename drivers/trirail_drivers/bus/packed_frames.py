@@ -56,6 +56,10 @@ class PackedFrames:
             packed = fd_packed(frame.packed) if fd else frame.packed
             row[: len(packed)], vector[1] = np.frombuffer(packed, np.uint8), len(packed)
 
+    def frame(self, number: int) -> Frame:
+        """Return one of the frames."""
+        return Frame.from_packed(self.frames[number].tobytes())
+
     def unpacked(self, first: int, end: int) -> list[tuple[int, bytearray]]:
         """Return a range of the frames; each is an identifier with flags, and data."""
         unpacked = []

@@ -13,7 +13,7 @@ from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.can_frame import ERROR, EXTENDED_BITS
 from trirail_drivers.bus.frame_calls import lendable_frames
 from trirail_drivers.bus.frame_io import frame_io
-from trirail_drivers.bus.frames import Frame, is_fd
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.errors import shortened
@@ -158,11 +158,6 @@ class Wire:
     def reopens(self) -> bool:
         """Whether a lost bus will be reopened."""
         return self._reopening is not None
-
-    @property
-    def fd(self) -> bool:
-        """Whether data frames are sent as CAN FD frames."""
-        return is_fd(self.bus)
 
     @property
     def access(self) -> BusAccess:

@@ -14,7 +14,7 @@ from trirail_drivers.config import DigitalIo, Drives
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.axis_row import NOTHING_SENT
 from trirail_drivers.driver.cyclic import expected_row
-from trirail_drivers.driver.row_updates import accept_counts
+from trirail_drivers.driver.row_updates import accept_counts, accept_statusword
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -59,7 +59,6 @@ class Cia402Axis(Axis):
         """Whether the drive has been sent a setpoint."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.controlword = canopen_frames.DISABLE_VOLTAGE
-        """Controlword sent last."""
         self.mode_bits = 0
         """Mode-specific controlword bits, added to "enable operation"."""
         self.held: int | None = None
@@ -108,7 +107,7 @@ class Cia402Axis(Axis):
         self.maps_outputs, self.outputs_kept = exchange.outputs is not None, exchange.outputs_kept
         self.outputs_sent = NOTHING_SENT
         self.velocity_per_metre = units.velocity_per_metre
-        self.position_at, self.velocity_at = exchange.setpoints.offset(0), exchange.setpoints.offset(1)
+        self.position_at, self.velocity_at, self.controlword_at = map(exchange.setpoints.offset, range(3))
 
     def forget_power_state(self) -> None:
         """Forget the last power state, and stop looking for positions of another node, since a new set-up begins."""
@@ -146,14 +145,10 @@ class Cia402Axis(Axis):
         if not stopping:
             self.forget_power_state()
 
-    def note_setpoint(self, target: int, offset: int) -> None:
-        """Record the position and velocity sent to the drive, in drive units."""
-        self.target, self.offset, self.has_setpoint = target, offset, True
-
     @property
     def setpoint(self) -> tuple[int, int]:
         """Setpoint sent last, in drive units; before the first setpoint, the drive's actual position."""
-        return (self.target, self.offset) if self.has_setpoint else (self.actual, 0)
+        return (int(self.target), self.offset) if self.has_setpoint else (self.actual, 0)
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:
         """Handle TPDO2: the position sampled at a SYNC, and the statusword if it is mapped in the same PDO."""
@@ -165,8 +160,7 @@ class Cia402Axis(Axis):
         accept_counts(self, counts, now)
         self.answer()
         if statusword is not None:
-            self.status_heard = now
-            self.update_status(statusword)
+            self.update_status(statusword, now)
         self._operational = True  # CiA 301: PDOs are sent only in NMT operational
 
     def is_steady(self, wanted: canopen_frames.TargetState) -> bool:
@@ -274,13 +268,11 @@ class Cia402Axis(Axis):
 
     def _on_statusword(self, data: bytes | bytearray, now: float) -> None:
         (statusword,) = canopen_frames.STATUSWORD.unpack(data)
-        self.status_heard = now
-        self.update_status(statusword)
+        self.update_status(statusword, now)
 
-    def update_status(self, statusword: int) -> None:
-        """Update the power state from a statusword."""
-        self.statusword = statusword
-        self.seen_clear |= ~statusword
+    def update_status(self, statusword: int, now: float) -> None:
+        """Update the power state from a statusword received at time `now` [s]."""
+        accept_statusword(self, statusword, now)
         state = canopen_frames.power_state(statusword)
         if state is None:
             self.note_fault("state", 0, f"statusword {statusword:04X} has no CiA 402 state")

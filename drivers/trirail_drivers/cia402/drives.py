@@ -7,7 +7,6 @@ positions, setpoints, heartbeats. Thus the controlword of a quick stop overtakes
 from __future__ import annotations
 
 import math
-import struct
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -16,6 +15,7 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.bus import load
+from trirail_drivers.bus.can_frame import DATA_AT
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import packed_frames
 from trirail_drivers.bus.reopening import Reopening
@@ -31,7 +31,14 @@ from trirail_drivers.driver.axis_row import NO_OFFSET, NOTHING_SENT
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
-from trirail_drivers.driver.row_updates import count_sync, end_reading
+from trirail_drivers.driver.row_updates import (
+    count_sync,
+    end_reading,
+    outputs_pending,
+    put_outputs,
+    put_setpoint,
+    scale_setpoint,
+)
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 from trirail_drivers.timing import BusTiming
@@ -64,13 +71,12 @@ class Cia402(Driver[Cia402Axis]):
                 canopen_frames.HEARTBEAT + drives.master_node, canopen_frames.NMT_STATE.pack(canopen_frames.OPERATIONAL)
             )
         ]
-        self._setpoints = tuple(axis.exchange.setpoints.frame() for axis in self._axes)
-        self._outputs = self._output_frames()
+        self._pack_frames()
         self._heartbeat_due: float | None = None
         self._wanted: canopen_frames.TargetState = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
-        self._lent_state: list[tuple[int, int, int]] = []
-        """Controlword, statusword and inputs of each drive with which the tables were last filled."""
+        self._expected_state: list[tuple[int, int]] = []
+        """Statusword and inputs of each drive for which the expected frames were last written."""
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
         """Set up the drives for a cycle of `period` seconds, read every value back, and start the drives without power.
@@ -133,16 +139,24 @@ class Cia402(Driver[Cia402Axis]):
         axis.update_position(start.counts)
         axis.inputs = start.inputs & axis.io.inputs
         axis.error_code = start.error_code
-        axis.update_status(start.statusword)
+        axis.update_status(start.statusword, axis.status_heard)
 
     def _prepare_frames(self) -> None:
         """Create the frames that each cycle sends."""
         self._set_period(self._period, process_data.traffic(axis.exchange for axis in self._axes))
-        self._setpoints = tuple(axis.exchange.setpoints.frame() for axis in self._axes)
-        self._outputs = self._output_frames()
         guarded = (axis.node for axis in self._axes if axis.exchange.guarded)
         self._beats[1:] = [Frame(canopen_frames.HEARTBEAT + node, b"\0", remote=True) for node in guarded]
-        self._tables.end, self._lent_state = self._tables.end[:0], []
+        self._pack_frames()
+        self._expected_state = []
+
+    def _pack_frames(self) -> None:
+        """Create the tables of the frames to send; digital outputs have frames if a drive has its outputs in a PDO."""
+        tables, packed = self._tables, partial(packed_frames, fd=self._timing.fd)
+        tables.begin, tables.beats = packed([self._sync]), packed(self._beats)
+        tables.setpoints = packed([axis.exchange.setpoints.frame() for axis in self._axes])
+        tables.end = tables.setpoints.headers
+        outputs = [Frame(axis.exchange.outputs or 0, bytes(canopen_frames.OUTPUTS.size)) for axis in self._axes]
+        tables.outputs = packed(outputs if any(axis.maps_outputs for axis in self._axes) else [])
 
     def _rejoin_drive(self, number: int, made: SetUp, start: Start) -> None:
         """Let a drive take part in the cycle again after its set-up in the background."""
@@ -248,24 +262,21 @@ class Cia402(Driver[Cia402Axis]):
         self._start_nodes()
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._command()  # if frames have to wait, stop commands are sent first
-        for axis, frame, metres, rate in zip(self._axes, self._setpoints, position, velocity, strict=True):
+        frames = self._tables.setpoints
+        for axis, frame, metres, rate in zip(self._axes, frames.frames, position, velocity, strict=True):
             if not axis.configured:
                 continue
-            try:
-                if axis.holds is not None:
-                    setpoint = axis.holds, 0
-                else:
-                    offset = axis.units.velocity(rate) if axis.exchange.setpoints.has_velocity else 0
-                    setpoint = axis.scale.counts(metres), offset
-                axis.exchange.setpoints.fill(frame, *setpoint, axis.controlword)
-            except (ValueError, OverflowError, struct.error):
+            if axis.holds is not None:
+                axis.target, axis.offset = axis.holds, 0
+            elif not scale_setpoint(axis, metres, rate):
                 self._refuse_setpoint(axis, metres, rate)
                 return
-            axis.note_setpoint(*setpoint)
-        for axis, frame in zip(self._axes, self._setpoints, strict=True):
+            axis.has_setpoint = True
+            put_setpoint(axis, frame[DATA_AT:])
+        for number, axis in enumerate(self._axes):
             if not axis.configured:
                 continue
-            if not self._wire.send(frame):
+            if not self._wire.send(frames.frame(number)):
                 axis.setpoints_lost += 1
             elif late:
                 axis.setpoints_late += 1
@@ -273,29 +284,23 @@ class Cia402(Driver[Cia402Axis]):
         self._command()
         self._recover()
 
-    def _output_frames(self) -> tuple[Frame, ...]:
-        """Return a frame of digital outputs for each drive, or no frames if no drive has its outputs in a PDO."""
-        if not any(axis.maps_outputs for axis in self._axes):
-            return ()
-        return tuple(Frame(axis.exchange.outputs or 0, bytes(canopen_frames.OUTPUTS.size)) for axis in self._axes)
-
     def _send_outputs(self) -> None:
         """Send the digital outputs that have changed.
 
         Drives apply outputs from a PDO at the next SYNC, and outputs from an SDO when they receive it.
         """
         for number, axis in enumerate(self._axes):
-            if not (axis.outputs_pending and axis.configured):
+            if not (outputs_pending(axis) and axis.configured):
                 continue
-            word, wanted = axis.outputs | axis.outputs_kept, axis.outputs
+            wanted = axis.outputs
             if axis.maps_outputs:
-                frame = self._outputs[number]
-                frame.fill(canopen_frames.OUTPUTS, word)
-                sent = self._wire.send(frame)
+                put_outputs(axis, self._tables.outputs.frames[number, DATA_AT:])
+                sent = self._wire.send(self._tables.outputs.frame(number))
             elif axis.unanswered or self._is_being_configured(axis):  # a server handles one request at a time (CiA 301)
                 continue
             else:
-                sent = self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + canopen_frames.OUTPUTS.pack(word))
+                word = canopen_frames.OUTPUTS.pack(wanted | axis.outputs_kept)
+                sent = self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + word)
             if sent:
                 axis.outputs_sent = wanted
 
@@ -320,21 +325,13 @@ class Cia402(Driver[Cia402Axis]):
             axis.is_steady(_target_of(axis, self._wanted)) for axis in self._axes
         ):
             return None
-        if any(axis.outputs_pending and not axis.maps_outputs for axis in self._axes):
+        if any(outputs_pending(axis) and not axis.maps_outputs for axis in self._axes):
             return None
         lent, beats = self._tables, len(self._beats)
-        if not len(lent.end):
-            packed = partial(packed_frames, fd=self._wire.fd)
-            lent.begin, lent.beats, lent.setpoints = map(packed, ([self._sync], self._beats, self._setpoints))
-            lent.outputs = packed(self._outputs)
-            lent.end = lent.setpoints.headers
         lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NO_OFFSET, *lent.counts
-        words = [(axis.controlword, axis.statusword, axis.inputs) for axis in self._axes]
-        if words != self._lent_state:
-            self._lent_state = words
-            for axis, frame in zip(self._axes, self._setpoints, strict=True):
-                axis.exchange.setpoints.fill(frame, *axis.setpoint, axis.controlword)
-            lent.setpoints.fill(self._setpoints, fd=self._wire.fd)
+        states = [(axis.statusword, axis.inputs) for axis in self._axes]
+        if states != self._expected_state:
+            self._expected_state = states
             lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected_rows(number)])
         return lent
 
@@ -352,8 +349,8 @@ class Cia402(Driver[Cia402Axis]):
 
     def send_on(self, first: int) -> None:
         """Send the setpoints in the tables one at a time, from drive `first` on, and then the changed outputs."""
-        for axis, packed in zip(self._axes[first:], self._tables.setpoints.frames[first:], strict=True):
-            axis.setpoints_lost += not self._wire.send(Frame.from_packed(packed.tobytes()))
+        for number, axis in enumerate(self._axes[first:], first):
+            axis.setpoints_lost += not self._wire.send(self._tables.setpoints.frame(number))
         self._send_outputs()
 
     def enable(self, alone: str | None = None) -> None:

@@ -173,10 +173,6 @@ class Units:
     velocity_name: str = "counts/s"
     acceleration_name: str = "counts/s2"
 
-    def velocity(self, velocity: float) -> int:
-        """Convert a slider velocity [m/s] to drive units. Raises ValueError or OverflowError if it is not finite."""
-        return round(self.velocity_per_metre * velocity)
-
     def check_velocity(self, name: str, fastest: float | None = None) -> None:
         """Raise DriveError if the unit of the velocity offset is unknown, or if `fastest` [m/s] does not fit it."""
         _check_known(name, "velocity", self.velocity_per_metre)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trirail_drivers.config import DigitalIo, Drives
-from trirail_drivers.driver.axis_row import AXIS, NOTHING_SENT, AxisRow
+from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET, NOTHING_SENT, AxisRow
 from trirail_drivers.driver.row_updates import accept_answer, answered_sync, is_late
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import shortened
@@ -82,6 +82,7 @@ class Axis(Answers):
         self.heard_within = MISSED_HEARTBEATS * drives.heartbeat
         self.status_within = self.follows_within = math.inf
         self.counts_per_metre, self.zero = scale.counts_per_metre, scale.offset
+        self.controlword_at = NO_OFFSET
         self._missed_positions = drives.missed_positions
         self.io = DigitalIo()
         """Digital outputs and inputs that the robot uses."""
@@ -90,11 +91,6 @@ class Axis(Answers):
         """Set the digital outputs and inputs that the robot uses; the outputs get their safe values."""
         self.io = io
         self.has_outputs, self.outputs, self.outputs_sent = bool(io.outputs), io.safe, NOTHING_SENT
-
-    @property
-    def outputs_pending(self) -> bool:
-        """Whether the wanted outputs differ from the outputs sent last, or no outputs have been sent yet."""
-        return self.has_outputs and self.outputs != self.outputs_sent
 
     @classmethod
     def in_row(cls, rows: NDArray[np.void], number: int, name: str, node: int, scale: Scale, drives: Drives) -> Self:

@@ -53,10 +53,12 @@ class AxisRow(ctypes.Structure):
     """Time since which the slider has been at rest there [s]."""
     command_age: int
     """Number of SYNCs since the last command to the drive."""
-    target: int
-    """Position sent last, in drive units, if the drive uses integers."""
+    target: float
+    """Position written last, in drive units; a whole number unless `floats` is set."""
     offset: int
-    """Velocity sent last, in drive units, if the drive uses integers."""
+    """Velocity written last, in multiples of `velocity_step`."""
+    controlword: int
+    """Controlword sent last, if the drive has one."""
     wanted: float
     """Position written last [m]; NaN if none is waiting to be sent."""
     wanted_rate: float
@@ -101,6 +103,8 @@ class AxisRow(ctypes.Structure):
     """Offset of the position in the setpoint frame [bytes]."""
     velocity_at: int
     """Offset of the velocity in the setpoint frame [bytes]; NO_OFFSET if the frame has no velocity."""
+    controlword_at: int
+    """Offset of the controlword in the setpoint frame [bytes]; NO_OFFSET if the frame has no controlword."""
     has_outputs: bool
     """Whether the drive has digital outputs."""
     maps_outputs: bool

@@ -72,10 +72,7 @@ def expected_row(
 
 
 class Cyclic:
-    """Tables of three drives.
-
-    They always contain the state of the drives; the frames are filled in when the tables are lent.
-    """
+    """Tables of three drives: always the state of the drives; a driver completes the rest before it lends them."""
 
     def __init__(self, bus: BusAccess, history: int, timing: BusTiming) -> None:
         """`history`: number of sent setpoints to keep."""

@@ -1,13 +1,19 @@
-"""Updates of one drive's row that every cycle makes, written once for both ways in which cycles run.
+"""What every cycle does to a drive's row and to its frames, written once for both ways in which cycles run.
 
 Drivers call these functions with an AxisRow. Quiet cycles compile the same functions and call them with a row of an
-array of AXIS; see trirail_drivers.driver.cyclic. A function may therefore use only the fields of AxisRow and
-arithmetic, and call no other function.
+array of AXIS; see trirail_drivers.driver.cyclic. A function may therefore use only the fields of AxisRow, arrays and
+arithmetic, and call no other function of this file.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trirail_drivers.driver.axis_row import NO_OFFSET
+from trirail_drivers.driver.scaling import FLOAT32_MAX, INT32_MAX
 
 if TYPE_CHECKING:
     from trirail_drivers.driver.axis_row import AxisRow
@@ -58,3 +64,65 @@ def accept_counts(row: AxisRow, counts: int, now: float) -> None:
 def accept_turns(row: AxisRow, turns: float) -> None:
     """Store a received position [turns]."""
     row.position = turns / row.counts_per_metre + row.zero
+
+
+def accept_statusword(row: AxisRow, statusword: int, now: float) -> None:
+    """Store a received statusword; `now` is the time of reception [s]."""
+    row.statusword, row.status_heard = statusword, now
+    row.seen_clear |= ~statusword
+
+
+def due_setpoint(row: AxisRow, commanded: NDArray[np.float64]) -> float:
+    """Return the position that was commanded at the SYNC at which the newest position was sampled [m], or NaN.
+
+    Parameters
+    ----------
+    commanded : (n,)
+        Positions commanded at each SYNC [m]; SYNC k is at k % n. A drive whose position is older is compared with the
+        oldest.
+
+    """
+    age = min(row.syncs - row.sampled, len(commanded) - 1)
+    return float(commanded[(row.syncs - age) % len(commanded)])
+
+
+def scale_setpoint(row: AxisRow, position: float, velocity: float) -> bool:
+    """Store a setpoint [m], [m/s] in drive units. Return False, and store nothing, if its frame cannot contain it."""
+    target, offset = row.counts_per_metre * (position - row.zero), 0.0
+    if not row.floats:
+        target = np.rint(target)
+    if row.velocity_at != NO_OFFSET:
+        offset = np.rint(row.velocity_per_metre * velocity / row.velocity_step)
+    fits = abs(target) <= FLOAT32_MAX if row.floats else -INT32_MAX - 1 <= target <= INT32_MAX
+    half = 1 << (8 * row.velocity_bytes - 1)
+    if not fits or not -half <= offset < half:
+        return False
+    row.target, row.offset = target, int(offset)
+    return True
+
+
+def put_setpoint(row: AxisRow, data: NDArray[np.uint8]) -> None:
+    """Write the stored setpoint, and the controlword if it is in the same frame, into the data of the frame."""
+    at = row.position_at
+    if row.floats:
+        data[at : at + 4].view(np.float32)[0] = row.target
+    else:
+        for i in range(4):
+            data[at + i] = int(row.target) >> 8 * i & 0xFF
+    if row.velocity_at != NO_OFFSET:
+        for i in range(row.velocity_bytes):
+            data[row.velocity_at + i] = row.offset >> 8 * i & 0xFF
+    if row.controlword_at != NO_OFFSET:
+        for i in range(2):
+            data[row.controlword_at + i] = row.controlword >> 8 * i & 0xFF
+
+
+def outputs_pending(row: AxisRow) -> bool:
+    """Whether the wanted outputs differ from the outputs sent last, or no outputs have been sent yet."""
+    return row.has_outputs and row.outputs != row.outputs_sent
+
+
+def put_outputs(row: AxisRow, data: NDArray[np.uint8]) -> None:
+    """Write the wanted outputs into the data of their frame, beside the outputs that the robot does not use."""
+    for i in range(4):
+        data[i] = (row.outputs | row.outputs_kept) >> 8 * i & 0xFF

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from trirail_drivers.config import Drive
 from trirail_drivers.errors import DriveError
 
+FLOAT32_MAX = (2.0 - 2.0**-23) * 2.0**127
+"""Largest finite 32-bit float."""
 INT32_MAX = 2**31 - 1
 UINT32_MAX = 2**32 - 1
 

@@ -77,13 +77,6 @@ class OdriveAxis(Axis):
             expected_row(identifier(cansimple.GET_ERROR), number, bytes(cansimple.ERRORS.size), any_of_it),
         ]
 
-    def input_pos(self, position: float, velocity: float) -> bytes:
-        """Return the data of Set_Input_Pos for a position [m] and a velocity [m/s].
-
-        Raises OverflowError or struct.error if a value does not fit into the message.
-        """
-        return cansimple.input_pos(self.scale.exact(position), self.scale.counts_per_metre * velocity)
-
     def with_setup_listener(self, number: int, handler: Handler) -> Handler:
         """Return a handler that also passes messages with this command number to a set-up that is in progress."""
         identifier = cansimple.identifier(self.node, number)

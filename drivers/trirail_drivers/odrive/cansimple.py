@@ -176,14 +176,6 @@ def request(node: int, number: int) -> Frame:
     return Frame(identifier(node, number), remote=True)
 
 
-def input_pos(position: float, velocity: float) -> bytes:
-    """Return the data of Set_Input_Pos for a position [turns] and a velocity [turns/s].
-
-    Raises OverflowError or struct.error if a value is out of range.
-    """
-    return INPUT_POS.pack(position, round(velocity / VELOCITY_STEP), 0)
-
-
 def serial_number(address: bytes) -> int | None:
     """Return the serial number in an Address message, or None if the message is too short to contain one."""
     data = address[SERIAL_AT]

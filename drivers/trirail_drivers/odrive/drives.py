@@ -26,7 +26,7 @@ from trirail_drivers.driver.axis_row import NO_OFFSET
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
-from trirail_drivers.driver.row_updates import count_sync, end_reading
+from trirail_drivers.driver.row_updates import count_sync, due_setpoint, end_reading
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import cansimple, setup
 from trirail_drivers.odrive.axis import OdriveAxis
@@ -78,8 +78,8 @@ class Odrive(Driver[OdriveAxis]):
         self._next_request = 0
         self._errors_due: float | None = None
         self._enabled = False
-        self._setpoints = SetpointSender(self._axes, self._wire, drives.quick_stop_deceleration)
         self._table_writer = CycleTableWriter(self._tables, self._axes, self._error_requests, self._requests)
+        self._setpoints = SetpointSender(self._axes, self._tables.setpoints, self._wire, drives.quick_stop_deceleration)
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:  # noqa: ARG002
         """Check the drives and prepare them, without power, for a cycle of `period` seconds. `fastest` is not used.
@@ -310,9 +310,7 @@ class Odrive(Driver[OdriveAxis]):
             fault = axis.find_fault(now, self._enabled and not axis.left_out)
             if fault is not None:
                 return fault
-            # The position is compared with the setpoint at the same SYNC, since the newest setpoint is further ahead.
-            history = self._tables.history
-            due = float(history[(axis.syncs - min(axis.age, len(history) - 1)) % len(history), number])
+            due = due_setpoint(axis, self._tables.history[:, number])
             if math.isnan(due) or not (self._enabled and axis.powered_up):
                 continue
             error = due - axis.position

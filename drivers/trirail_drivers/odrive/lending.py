@@ -13,6 +13,7 @@ from trirail_drivers.bus.can_frame import DATA_AT
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import packed_frames
 from trirail_drivers.driver.cyclic import Cyclic
+from trirail_drivers.driver.row_updates import put_setpoint, scale_setpoint
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.axis import OdriveAxis
 
@@ -26,12 +27,11 @@ class CycleTableWriter:
         """`errors` and `requests` are the frames that request the errors and the position of each drive."""
         self._tables = tables
         self._axes = axes
-        setpoint = cansimple.input_pos(0.0, 0.0)
-        setpoints = [cansimple.command(axis.node, cansimple.SET_INPUT_POS, setpoint) for axis in axes]
+        nothing = bytes(cansimple.INPUT_POS.size)
+        setpoints = [cansimple.command(axis.node, cansimple.SET_INPUT_POS, nothing) for axis in axes]
         self._all = packed_frames([*setpoints, *requests])
         self._requests = self._all.part(len(setpoints), len(setpoints) + len(requests))
         tables.beats, tables.setpoints = packed_frames(errors), self._all.part(0, len(setpoints))
-        self._data = [frame[DATA_AT : DATA_AT + len(setpoint)].data for frame in tables.setpoints.frames]
         self._expected: list[tuple[int, int]] = []
         """Axis state and procedure result of each drive for which the expected frames were last written."""
 
@@ -41,10 +41,11 @@ class CycleTableWriter:
         `follow` is True if the drives follow setpoints; the following error may then be at most `within` [m].
         """
         self._tables.begin = self._all if follow else self._requests
-        for axis, data in zip(self._axes, self._data, strict=True):
+        for axis, frame in zip(self._axes, self._tables.setpoints.frames, strict=True):
             axis.waits, axis.follows_within = follow, within if follow and axis.powered_up else math.inf
             if follow:
-                data[:] = axis.input_pos(axis.wanted, axis.wanted_rate)
+                scale_setpoint(axis, axis.wanted, axis.wanted_rate)
+                put_setpoint(axis, frame[DATA_AT:])
         states = [axis.heartbeat_state for axis in self._axes]
         if states != self._expected:
             self._expected = states

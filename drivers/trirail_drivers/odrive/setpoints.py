@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Sequence
 from typing import Final
 
+from trirail_drivers.bus.can_frame import DATA_AT
+from trirail_drivers.bus.packed_frames import PackedFrames
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.ramp import brake
+from trirail_drivers.driver.row_updates import put_setpoint, scale_setpoint
 from trirail_drivers.interface import Triple
-from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.axis import OdriveAxis
 
 SETTLE_TIME_S: Final = 0.05
@@ -25,11 +26,12 @@ class SetpointSender:
     Each axis stores the setpoint written last, the setpoint sent last, and the position that the bus accepted last.
     """
 
-    def __init__(self, axes: Sequence[OdriveAxis], wire: Wire, deceleration: float) -> None:
-        """`deceleration` is the deceleration of the quick-stop ramp [m/s²]."""
+    def __init__(self, axes: Sequence[OdriveAxis], frames: PackedFrames, wire: Wire, deceleration: float) -> None:
+        """`frames` are those of Set_Input_Pos, and `deceleration` is that of the quick-stop ramp [m/s²]."""
         self.period = 0.0
         """Cycle period [s]."""
         self._axes = axes
+        self._frames = frames
         self._wire = wire
         self._deceleration = deceleration
         self._standstill_time: float | None = None
@@ -62,7 +64,7 @@ class SetpointSender:
         Return the first axis whose setpoint does not fit into a message, or None.
         """
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
-            if not _is_sendable(axis, metres, rate):
+            if not scale_setpoint(axis, metres, rate):
                 return axis
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             axis.wanted, axis.wanted_rate = metres, rate
@@ -103,8 +105,9 @@ class SetpointSender:
                 axis.in_force = metres
         stopping = self.stopping
         for number, (axis, (metres, rate)) in enumerate(zip(self._axes, setpoints, strict=True)):
-            data = axis.input_pos(metres, rate)
-            if number < sent or self._wire.send(cansimple.command(axis.node, cansimple.SET_INPUT_POS, data)):
+            scale_setpoint(axis, metres, rate)
+            put_setpoint(axis, self._frames.frames[number, DATA_AT:])
+            if number < sent or self._wire.send(self._frames.frame(number)):
                 axis.in_force = metres
             else:
                 axis.setpoints_lost += 1
@@ -131,11 +134,3 @@ class SetpointSender:
     def _braked_setpoint(self, axis: OdriveAxis) -> tuple[float, float]:
         """Return the ramp's next setpoint, one period after the position that the bus accepted last."""
         return brake(axis.in_force, axis.sent_rate, self._deceleration, self.period)
-
-
-def _is_sendable(axis: OdriveAxis, metres: float, rate: float) -> bool:
-    try:
-        axis.input_pos(metres, rate)
-    except (ValueError, OverflowError, struct.error):
-        return False
-    return math.isfinite(metres)  # NaN causes no error when it is packed

@@ -21,7 +21,6 @@ from trirail_drivers.bus.can_frame import DATA_AT, FRAME_SIZES, LENGTH_AT
 from trirail_drivers.driver import row_updates
 from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET
 from trirail_drivers.driver.cyclic import EXPECTED, MOST_FRAMES, TIMES
-from trirail_drivers.driver.scaling import INT32_MAX
 
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
@@ -141,6 +140,12 @@ _is_late: Any = compiled()(row_updates.is_late)
 _accept_answer: Any = compiled()(row_updates.accept_answer)
 _accept_counts: Any = compiled()(row_updates.accept_counts)
 _accept_turns: Any = compiled()(row_updates.accept_turns)
+_accept_statusword: Any = compiled()(row_updates.accept_statusword)
+_due_setpoint: Any = compiled()(row_updates.due_setpoint)
+_scale_setpoint: Any = compiled()(row_updates.scale_setpoint)
+_put_setpoint: Any = compiled()(row_updates.put_setpoint)
+_outputs_pending: Any = compiled()(row_updates.outputs_pending)
+_put_outputs: Any = compiled()(row_updates.put_outputs)
 
 
 @compiled()
@@ -207,9 +212,7 @@ def process_frames(
         if row.position_at != NO_OFFSET and not _accept_position(axis, frame, DATA_AT + row.position_at, now):
             return i
         if row.status_at != NO_OFFSET:
-            axis.statusword = _number(frame, DATA_AT + row.status_at, 2)
-            axis.seen_clear |= ~axis.statusword
-            axis.status_heard = now
+            _accept_statusword(axis, _number(frame, DATA_AT + row.status_at, 2), now)
         if row.lives:
             axis.heard = now
         times[0].traffic += times[0].frame_ns[length]
@@ -242,22 +245,14 @@ def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, no
             return False
         if now - axis.status_heard > axis.status_within:
             return False
-        if len(history) and math.isfinite(axis.follows_within):
-            due = history[(axis.syncs - min(age, len(history) - 1)) % len(history), i]
-            if not abs(due - axis.position) <= axis.follows_within:
-                return False
+        monitored = len(history) and math.isfinite(axis.follows_within)
+        if monitored and not abs(_due_setpoint(axis, history[:, i]) - axis.position) <= axis.follows_within:
+            return False
     if not now < times[0].due:
         return False
     for i in range(3):
         _end_reading(axes[i])
     return True
-
-
-@compiled()
-def _put(frame: NDArray[np.uint8], at: int, number: int, size: int) -> None:
-    """Write a number as `size` little-endian bytes at offset `at` of a frame's data."""
-    for i in range(size):
-        frame[DATA_AT + at + i] = (number >> (8 * i)) & 0xFF
 
 
 @compiled(i8(FRAMES, AXES, f8[:, ::1]))
@@ -268,39 +263,20 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
     """
     for i in range(3):
         axis = axes[i]
-        counts = axis.counts_per_metre * (sent[0, i] - axis.zero)
-        if axis.floats:
-            at = DATA_AT + axis.position_at
-            frames[i, at : at + 4].view(np.float32)[0] = counts
-            if not math.isfinite(frames[i, at : at + 4].view(np.float32)[0]):
-                return False
-        else:
-            counts = np.rint(counts)
-            if not abs(counts) <= INT32_MAX:
-                return False
-            axis.target, axis.offset = np.int64(counts), 0
-            _put(frames[i], axis.position_at, axis.target, 4)
-        if axis.velocity_at != NO_OFFSET:
-            offset = np.rint(axis.velocity_per_metre * sent[1, i] / axis.velocity_step)
-            if not abs(offset) <= (1 << (8 * axis.velocity_bytes - 1)) - 1:
-                return False
-            axis.offset = np.int64(offset)
-            _put(frames[i], axis.velocity_at, axis.offset, axis.velocity_bytes)
+        if not _scale_setpoint(axis, sent[0, i], sent[1, i]):
+            return False
+        _put_setpoint(axis, frames[i, DATA_AT:])
         axis.wanted, axis.wanted_rate = sent[0, i], sent[1, i]
     return True
 
 
 @compiled()
-def needs_python(axes: NDArray[np.void], words: NDArray[np.int64]) -> bool:
-    """Return True if an output has changed on a drive that accepts outputs only by SDO, which Python sends.
-
-    `words` (3,) are the values of the drives' object 60FEh.
-    """
+def needs_python(axes: NDArray[np.void]) -> bool:
+    """Return True if an output has changed on a drive that accepts outputs only by SDO, which Python sends."""
+    needed = False
     for i in range(3):
-        axis = axes[i]
-        if axis.has_outputs and not axis.maps_outputs and words[i] != axis.outputs_sent:
-            return True
-    return False
+        needed = needed or (not axes[i].maps_outputs and _outputs_pending(axes[i]))
+    return needed
 
 
 @compiled()
@@ -317,8 +293,8 @@ def send_outputs(
     """
     for i in range(len(headers)):
         axis = axes[i]
-        if axis.has_outputs and axis.maps_outputs and axis.outputs != axis.outputs_sent:
-            _put(frames[i], 0, axis.outputs | axis.outputs_kept, 4)
+        if axis.maps_outputs and _outputs_pending(axis):
+            _put_outputs(axis, frames[i, DATA_AT:])
             if not send_frames(bus, headers[i : i + 1], frames[i : i + 1], times):
                 return False
             axis.outputs_sent = axis.outputs

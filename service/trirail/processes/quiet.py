@@ -336,7 +336,7 @@ def _switch_outputs(
     """Switch the outputs that are due with the setpoints. Return False, and change nothing, if Python must do it."""
     if len(tables.switches) == 0:
         return True
-    if needs_python(axes, tables.words):
+    if needs_python(axes):
         return False
     if s.logged == 0:
         s.report_due = s.cycle + s.report_after
