@@ -17,7 +17,10 @@ RECORDINGS = sorted((Path(__file__).parents[1] / "data" / "recordings").iterdir(
 @pytest.mark.parametrize("packed", RECORDINGS, ids=[each.name.removesuffix(".rrd.xz") for each in RECORDINGS])
 @pytest.mark.filterwarnings("ignore:.*older version")
 def test_a_recording_of_an_earlier_version_is_replayed_to_the_last_bit(packed: Path, tmp_path: Path) -> None:
-    """Each session has an ordinary goal, a pause, a stop, a jog, two blended goals and power switched on and off."""
+    """Each session has an ordinary goal, a pause, a stop, a jog, two blended goals and power switched on and off.
+
+    The plans are those that were recorded; planned again, they may be rounded otherwise on this processor.
+    """
     path = tmp_path / "session.rrd"
     path.write_bytes(lzma.decompress(packed.read_bytes()))
     recording = read(path)

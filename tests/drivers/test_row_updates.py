@@ -100,11 +100,11 @@ def test_a_setpoint_is_in_its_frame_as_struct_packs_it_or_is_refused_whole(
     entries: list[int], position: float, velocity: float, controlword: int
 ) -> None:
     assume(process_data.TARGET_POSITION in entries)
-    axis, pdo = made(offset=0.0), process_data.SetpointPdo(0x301, tuple(entries))
+    axis, pdo = made(offset=0.25), process_data.SetpointPdo(0x301, tuple(entries))
     axis.position_at, axis.velocity_at, axis.controlword_at = map(pdo.offset, range(3))
     axis.velocity_per_metre, axis.velocity_step, axis.velocity_bytes = 2e6, 2.0, 4
     axis.controlword, axis.target, axis.offset = controlword, 1.0, 2
-    counts, speed = round(position * 1e6), round(velocity * 1e6)
+    counts, speed = round((position - 0.25) * 1e6), round(velocity * 1e6)
     within = range(-(1 << 31), 1 << 31)
     fits = counts in within and (speed in within or not pdo.has_velocity)
     assert scale_setpoint(axis, position, velocity) == fits
@@ -112,6 +112,7 @@ def test_a_setpoint_is_in_its_frame_as_struct_packs_it_or_is_refused_whole(
     if not fits:
         assert (axis.target, axis.offset) == (1.0, 2)
         return
+    assert axis.offset == (speed if pdo.has_velocity else 0)
     put_setpoint(axis, data)
     pdo.fill(frame, counts, speed if pdo.has_velocity else 0, controlword)
     assert data.tobytes() == bytes(frame.packed[DATA_AT:]).ljust(8, b"\0")

@@ -34,6 +34,7 @@ from trirail_drivers.interface import (
     UnreadyDrives,
 )
 
+from trirail.analysis.plan_comparison import is_same_plan
 from trirail.config import Config
 from trirail.control.control import Control, TimedInput
 from trirail.control.local_planner import LocalPlanner
@@ -62,7 +63,11 @@ class Comparison(NamedTuple):
     plans: int
     """Number of recorded answers from the planner that were used; 0 if the replay made all plans itself."""
     plans_differing: int
-    """Number of recorded answers that differ from the plan that the replay made for the same request."""
+    """Number of recorded answers that differ by more than rounding from the plan that the replay made for the same
+    request.
+    """
+    plans_rounded: int
+    """Number of recorded answers that differ from this plan only by rounding, which depends on the processor."""
     differing: int
     """Number of cycles in which any bit of the setpoints, the mode or the outputs differs from the recording."""
     first: int | None
@@ -117,6 +122,7 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
         requests=len(requests),
         plans=planner.answers if isinstance(planner, _RecordedPlanner) else 0,
         plans_differing=planner.differing if isinstance(planner, _RecordedPlanner) else 0,
+        plans_rounded=planner.rounded if isinstance(planner, _RecordedPlanner) else 0,
         differing=int(differs.sum()),
         first=int(records["cycle"][np.argmax(differs)]) if differs.any() else None,
         position=tuple(greatest[0]),
@@ -236,7 +242,7 @@ class _RecordedPlanner:
 
     def __init__(self, config: Config) -> None:
         self.answers = 0
-        self.differing = 0
+        self.differing = self.rounded = 0
         self._planner = MotionPlanner(config)
         self._planned: dict[int, PlanAnswer] = {}
 
@@ -248,8 +254,11 @@ class _RecordedPlanner:
         """Count the recorded answers among the inputs of a cycle, and those that differ from the new plans."""
         for entry in entries:
             if isinstance(entry.given, PlanAnswer):
+                planned = self._planned.get(entry.given.number)
                 self.answers += 1
-                self.differing += self._planned.get(entry.given.number) != entry.given
+                if planned != entry.given:
+                    same = is_same_plan(planned, entry.given)
+                    self.rounded, self.differing = self.rounded + same, self.differing + (not same)
 
 
 class _RecordedDrives:

@@ -235,7 +235,9 @@ def _print_comparison(
         lines.add("[yellow]not replayed[/]", f"{compared.lacking} cycles: what came before them is not recorded")
     if compared.plans:
         otherwise = f"[bold red]{compared.plans_differing} come out otherwise[/]"
-        again = otherwise if compared.plans_differing else "all come out the same to the last bit"
+        rounded = f"all come out the same, {compared.plans_rounded} of them except for rounding"
+        alike = rounded if compared.plans_rounded else "all come out the same to the last bit"
+        again = otherwise if compared.plans_differing else alike
         lines.add("plans", f"{compared.plans} as they were answered; planned again, {again}")
     else:
         lines.add("plans", "computed again: the recording has none, or those of another configuration")
