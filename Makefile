@@ -16,6 +16,8 @@ check: $(READY)  ## lint, format, types and import contracts alone
 	$(VENV)/bin/lint-imports
 
 test test-side-by-side test-alone: export PYTHONHASHSEED = 0
+# Where this is set, as in many containers, every worker and every program of a test would compile all modules anew.
+test test-side-by-side test-alone: export PYTHONDONTWRITEBYTECODE =
 test: check  ## before each commit, five minutes: lint, format, types, import contracts, tests of every room, whole services
 	$(VENV)/bin/pytest --numprocesses auto --dist worksteal --effort 0.1 -m "core or not (slow or viewer or long or alone)"
 
