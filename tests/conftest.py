@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import Any, cast
 
+import blas_threads  # noqa: F401 - before numpy
 import can
 import msgspec
 import numpy as np
