@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 from alignment.cameras import FIELD, BuiltStage, wide_camera
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.geometry_calibration import (
@@ -119,6 +119,7 @@ def test_one_correction_anywhere_in_the_travel(name: str) -> None:
     assert made.true_pose == pytest.approx(aim, abs=2e-6)
 
 
+@settings(max_examples=30)  # each is a whole calibration of the stage
 @given(seed=SEEDS, name=names)
 @example(seed=0, name="uvw")
 def test_lost_swapped_and_wrong_marks_are_named_and_change_nothing(seed: int, name: str) -> None:
