@@ -27,6 +27,8 @@ STEP_NS: Final = 200_000
 """How time passes for who waits."""
 FILLER: Final = CAN_FRAME.pack(STANDARD_BITS, 0, b"")
 """What a full bus is full of: nobody hears it."""
+ROOM_BYTES: Final = 1 << 17
+"""Send buffer of the service's end, for 342 frames: the usual one takes 11,000, which a test would have to fill up."""
 _channels = itertools.count()
 
 
@@ -123,6 +125,8 @@ class Lockstep:
             listening.listen()
             bus = WaitingUnix(str(folder / "can"), fd=carrier == "fd")
             bus.time = time
+            assert bus.carrier is not None
+            bus.carrier.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, ROOM_BYTES)
             end, _ = listening.accept()
         end.setblocking(False)
         self._stack.callback(end.close)
