@@ -15,6 +15,7 @@ import signal
 import socket
 import sys
 import traceback
+from pathlib import Path
 from typing import Final, NoReturn
 
 from setproctitle import setproctitle
@@ -136,6 +137,14 @@ def main() -> None:
 
     if not compiling.load():
         compiling.compile_all(lambda _: None)
+    sys.path.append(str(Path(__file__).parent))
+    import parsed_eds
+    from trirail.config import SIM, load
+    from trirail_drivers.connection.opening import simulated_bus
+
+    parsed_eds.stand_between(parsed_eds.import_od, parsed_eds.compact_arrays, parsed_eds.sections_of)
+    shipped = load(SIM)
+    simulated_bus(shipped.can, shipped.drives).shutdown()  # parses for all services that have these drives
     gc.collect()
     gc.freeze()
     with socket.socket(fileno=int(sys.argv[1])) as control:
