@@ -11,4 +11,4 @@ with pytest.MonkeyPatch.context() as environment:
     for name, value in ONE_THREAD.items():
         environment.setenv(name, value)
     import numpy.linalg  # noqa: F401 - each library reads the environment when it is loaded
-    import scipy.linalg  # noqa: F401 - as above
+    import scipy.linalg  # type: ignore[import-untyped]  # noqa: F401 - as above
