@@ -3,10 +3,10 @@
 python tools/bench_drives.py CONFIG PATH PROCESSOR [TIMES]
 
 The drives run on PROCESSOR, which must not be the loop's. Without TIMES, they sleep until a frame arrives, and have
-real-time priority if permitted. With TIMES, they poll for frames all the time, as the hardware of a CAN controller
-does, and they write the times at which SYNCs arrived to the file TIMES at SIGTERM, as 64-bit floats in seconds. If they
-slept, the times would include their own wake-up, which takes longer than all that a sender does. The kernel does not
-stamp a frame between processes.
+real-time priority if permitted. With TIMES, they poll for frames all the time from the first SYNC on, as the hardware
+of a CAN controller does, and they write the times at which SYNCs arrived to the file TIMES at SIGTERM, as 64-bit floats
+in seconds. If they slept, the times would include their own wake-up, which takes longer than all that a sender does.
+The kernel does not stamp a frame between processes.
 
 tools/virtual_drives.py is the version for users: it accepts faults and reports the drives' states.
 """
@@ -57,11 +57,12 @@ def main() -> None:
         syncs, polled = array("d"), select.poll()
         polled.register(wire.fileno(), select.POLLIN)
         polls = times is not None and (os.cpu_count() or 1) > 1
-        wait = partial(_busy_poll, polled) if polls else partial(polled.poll, POLL * 1000.0)
+        sleep, busy_poll = partial(polled.poll, POLL * 1000.0), partial(_busy_poll, polled)
         print("ready", flush=True)
         try:
             while True:
-                wait()
+                # Before the first SYNC, the kernel needs this processor too: to load a sender took two minutes.
+                (busy_poll if polls and syncs else sleep)()
                 arrived = time.monotonic()
                 while (frame := wire.recv(0.0)) is not None:
                     if frame.arbitration_id == SYNC:
