@@ -228,6 +228,11 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+def pytest_unconfigure() -> None:
+    """Have the collector look at everything again: nanobind prints what is left at the end of the interpreter."""
+    gc.unfreeze()
+
+
 @pytest.fixture
 def robots() -> Iterator[Callable[..., Rig]]:
     """Makes a robot of what Rig takes; its bus is shut down at the end of the test."""
