@@ -88,6 +88,7 @@ def test_other_shapes_are_other_plans() -> None:
         PathExtension(1, 2, 0.0, plan.run.path, plan.reply),
         replace(plan, first=None),
         replace(plan, switches=b""),
+        *(replace(plan, switches=np.array([each], SWITCH).tobytes()) for each in ((0.2, 0.1, 1, 1), (0.2, 0.1, 0, 0))),
         replace(plan, run=replace(plan.run, path=longer)),
         replace(plan, run=replace(plan.run, seams=())),
         replace(plan, reply=plan.reply.with_duration(2.0)),

@@ -4,7 +4,7 @@ The replay runs in a single process, as fast as possible. The decisions of the c
 the feedback of the drives at each SYNC, and on the inputs, which are goals, commands, disturbances and the planner's
 answers. A recording contains all of these, each with the number of its cycle. Therefore the setpoints of the replay
 must equal the recorded setpoints in every bit. The control also makes the same requests to the planner. The replay
-plans these requests again, and compares the results with the recorded answers.
+plans these requests again, and compares the results with the recorded answers, which may differ by rounding.
 
 With another configuration, the recorded feedback of the drives and the recorded answers of the planner are not valid.
 The replay then uses simulated drives, whose clock advances by one period per cycle, and a planner that answers in the
