@@ -29,6 +29,7 @@ def drives(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Pat
     text = config.read_text()
     text = text.replace('interface = "simulated" ', f'interface = "unix"\nchannel = "{bus}" ')
     text = text.replace("live_port = 0", "live_port = 0\ncapture_can = true")
+    text = text.replace("sdo_timeout = 5.0", "sdo_timeout = 1.0")  # the start waits for each silent drive
     assert "capture_can" in text
     if request.param == "odrive":
         text = text.replace('protocol = "cia402"', 'protocol = "odrive"').replace("counts_per_metre = 1e7", TURNS)
@@ -68,7 +69,7 @@ def reset_once_configured(robot: Robot) -> None:
     wait_until(accepted)
 
 
-@pytest.mark.long
+@pytest.mark.alone  # its drives are a process without real-time rights
 def test_a_service_recovers_without_a_restart(drives: tuple[Path, str, Tell], tmp_path: Path) -> None:
     config, locator, tell = drives
     tell("all silent")

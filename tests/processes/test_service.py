@@ -758,8 +758,10 @@ def test_a_killed_recorder_does_not_matter(service: Service) -> None:
         assert state.pose[0] == pytest.approx(0.1, abs=1e-5)
         told(robot, lambda heard: sum(event.message.startswith("recording to") for event in heard) == 2)
     assert service.end() == 0
-    assert "the recorder has died (killed by SIGKILL)" in service.log.read_text()
-    assert len(list((service.folder / "recordings").glob("*.rrd"))) == 2
+    log = service.log.read_text()
+    assert "the recorder has died (killed by SIGKILL)" in log
+    # Each recorder has a file. A busy machine may freeze another one, which the supervisor then replaces, too.
+    assert len(list((service.folder / "recordings").glob("*.rrd"))) == 1 + log.count("the recorder has died")
 
 
 @pytest.mark.core

@@ -226,8 +226,6 @@ class Cia402(Driver[Cia402Axis]):
             fault = self._homing.step(now)
             if fault is not None:
                 self._wire.fail(fault)
-        for axis in self._axes:
-            self._poll_by_sdo(axis, now)
         return self._feedback()
 
     def _feedback(self) -> Feedback:
@@ -251,10 +249,14 @@ class Cia402(Driver[Cia402Axis]):
 
         Setpoints that are not finite or exceed 32-bit counts latch a fault with cause "setpoint" instead. During
         power-up, the next controlwords are sent after the setpoints, so that no drive gets power without a setpoint.
-        Outputs are sent last, even if there are no setpoints.
+        Requests for values are sent after them, because they would delay the setpoints on the bus. Outputs are sent
+        last. Requests and outputs are also sent if there are no setpoints.
         """
         if not self._stopped_in_this_cycle:
             self._write_setpoints(position, velocity)
+        now = self._clock()
+        for axis in self._axes:
+            self._poll_by_sdo(axis, now)
         self._send_outputs()
 
     def _write_setpoints(self, position: Triple, velocity: Triple) -> None:
