@@ -22,7 +22,7 @@ from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import Notice
 from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Mode, SetOutput
-from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
+from trirail_drivers.interface import Counts, DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
 
 SHIPPED = load(SIM)
 # In simulated time no machine keeps the drives waiting: what is lost is lost as soon as that of real ones.
@@ -50,6 +50,7 @@ class PerfectDrives:
     bus_load = next_sync = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
     traffic = 0
+    counts = Counts(), Counts(), Counts()
     reported_faults: tuple[DriveFault | None, ...] = (None, None, None)
 
     def __init__(self, position: Triple = STILL) -> None:

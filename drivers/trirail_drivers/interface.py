@@ -107,7 +107,6 @@ class Feedback(NamedTuple):
     """First fault since the last reset or, if a drive then did not stop, the fault of that drive; None if there is no
     fault.
     """
-    counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
     warnings: tuple[str, ...] = ()
     """New warnings for people, one line each; each warning appears in one feedback only."""
     age: tuple[int, int, int] = (0, 0, 0)
@@ -164,6 +163,10 @@ class DriveGroup(Protocol):
 
         Frames that the kernel filters out are not counted.
         """
+
+    @property
+    def counts(self) -> tuple[Counts, Counts, Counts]:
+        """Numbers of late and lost positions and setpoints of each drive."""
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:

@@ -24,7 +24,6 @@ from trirail_drivers.driver.row_updates import (
     count_sync,
     due_setpoint,
     end_reading,
-    is_late,
     outputs_pending,
     put_outputs,
     put_setpoint,
@@ -159,7 +158,6 @@ def test_an_answer_is_late_once_where_it_comes_later_in_its_cycle_than_the_one_b
 def test_a_second_answer_to_a_sync_is_not_late() -> None:
     axis = run(["before the read"])
     assert answered_sync(axis) == 1
-    assert not is_late(axis, 1)
     axis.answer()
     assert (axis.sampled, axis.late, axis.lost) == (1, 0, 0)
 

@@ -176,7 +176,7 @@ class Cia402Axis(Axis):
         return (
             (settled and no_fault and lives and quiet and not asked)
             and (self.cyclic and self.follows and self.holds is None and self.has_setpoint)
-            and self.missed == 0
+            and self.missed < self.missed_limit
             and self._followed == follows
             and self.controlword == self.word(-math.inf, wanted)
         )

@@ -234,7 +234,6 @@ class Cia402(Driver[Cia402Axis]):
             (a.position, b.position, c.position),
             (a.shown_state, b.shown_state, c.shown_state),
             self._wire.fault,
-            (a.counts, b.counts, c.counts),
             self._wire.warnings(),
             (a.age, b.age, c.age),
             self._homing.under_way,
@@ -323,10 +322,14 @@ class Cia402(Driver[Cia402Axis]):
         due = self._heartbeat_due
         if due is None or not (self._wire.is_healthy and self._homing.idle) or self._period == 0.0:
             return None
-        if self._stopped_in_this_cycle or not all(
-            axis.is_steady(_target_of(axis, self._wanted)) for axis in self._axes
-        ):
+        if self._stopped_in_this_cycle:
             return None
+        for axis in self._axes:
+            wanted = _target_of(axis, self._wanted)
+            # A drive without power that misses PDOs is sent commands again, also by SDO.
+            axis.missed_limit = self._drives.missed_positions if wanted is PowerState.OPERATION_ENABLED else 1
+            if not axis.is_steady(wanted):
+                return None
         if any(outputs_pending(axis) and not axis.maps_outputs for axis in self._axes):
             return None
         lent, beats = self._tables, len(self._beats)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from trirail_drivers.driver.axis_row import AxisRow
+from trirail_drivers.driver.row_updates import is_far, turns_back
 from trirail_drivers.interface import DriveFault
 
 FAR_APART_M: Final = 0.005
@@ -83,12 +84,12 @@ class AnswersPerSync:
     than they are apart.
     """
 
-    __slots__ = ("_counted_from", "_counts_far", "_far", "_far_in_a_row", "_row", "_two", "_with_two")
+    __slots__ = ("_counted_from", "_far", "_far_in_a_row", "_row", "_two", "_with_two")
 
     def __init__(self, row: AxisRow) -> None:
         """`row` contains the newest position and step of the drive."""
         self._row = row
-        self._counts_far = abs(row.counts_per_metre) * FAR_APART_M
+        row.far_apart = abs(row.counts_per_metre) * FAR_APART_M
         self._two = self._far = False
         self._far_in_a_row = self._with_two = 0
         self._counted_from = 0
@@ -96,11 +97,9 @@ class AnswersPerSync:
 
     def add_position(self, counts: int) -> None:
         """Handle a received position [counts], before it is stored in the row."""
-        row = self._row
-        step = counts - row.newest
-        if row.came:
-            self._two = self._two or step * row.step < 0
-            self._far = self._far or abs(step) > self._counts_far
+        if self._row.came:
+            self._two = self._two or turns_back(self._row, counts)
+            self._far = self._far or is_far(self._row, counts)
 
     @property
     def is_clear(self) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from trirail_drivers.config import DigitalIo, Drives
 from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET, NOTHING_SENT, AxisRow
-from trirail_drivers.driver.row_updates import accept_answer, answered_sync, is_late
+from trirail_drivers.driver.row_updates import accept_answer, answered_sync, unanswered
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Counts, DriveFault
@@ -33,14 +33,11 @@ class Answers(AxisRow):
     @property
     def missed(self) -> int:
         """Number of unanswered SYNCs. The newest SYNC is not counted while its answer is not yet due."""
-        return self.syncs - self.sampled - (not self.prompt)
+        return unanswered(self)
 
     def answer(self) -> None:
         """Assign a received position to the SYNC that it answers."""
-        sampled = answered_sync(self)
-        self.lost += max(0, sampled - self.sampled - 1)
-        self.late += is_late(self, sampled)
-        accept_answer(self, sampled)
+        accept_answer(self, answered_sync(self))
 
     def clear_missed(self) -> None:
         """Forget the unanswered SYNCs."""
@@ -80,7 +77,8 @@ class Axis(Answers):
         """Whether the drive's position is relative to a known place."""
         self.heard = math.inf
         self.heard_within = MISSED_HEARTBEATS * drives.heartbeat
-        self.status_within = self.follows_within = math.inf
+        self.status_within = self.follows_within = self.far_apart = math.inf
+        self.missed_limit = drives.missed_positions
         self.counts_per_metre, self.zero = scale.counts_per_metre, scale.offset
         self.controlword_at = NO_OFFSET
         self._missed_positions = drives.missed_positions

@@ -95,10 +95,14 @@ class AxisRow(ctypes.Structure):
     """Size of a velocity in the setpoint frame [bytes]."""
     still: float
     """Largest movement at which the slider still counts as at rest [counts]."""
+    far_apart: float
+    """Difference between two positions after one SYNC above which they come from two sliders [counts]."""
     heard_within: float
     """Largest age of `heard` [s]."""
     status_within: float
     """Largest age of `status_heard` [s]."""
+    missed_limit: int
+    """Number of consecutive unanswered SYNCs from which a cycle is no longer quiet."""
     position_at: int
     """Offset of the position in the setpoint frame [bytes]."""
     velocity_at: int

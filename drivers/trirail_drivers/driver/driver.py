@@ -21,7 +21,7 @@ from trirail_drivers.driver.recovery import AnyAxis, Recovery
 from trirail_drivers.driver.refusals import SetUpDrive, merge_notes
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError
-from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection, Unready, UnreadyDrives
+from trirail_drivers.interface import NAMES, Clock, Counts, DriveFault, MissingProtection, Unready, UnreadyDrives
 from trirail_drivers.timing import BusTiming
 
 Result = TypeVar("Result")
@@ -152,6 +152,12 @@ class Driver(ABC, Generic[AnyAxis]):
     def traffic(self) -> int:
         """Duration of all frames sent and received since the start, with worst-case bit stuffing [ns]."""
         return self._wire.traffic + int(self._tables.times[0]["traffic"])
+
+    @property
+    def counts(self) -> tuple[Counts, Counts, Counts]:
+        """Numbers of late and lost positions and setpoints of each drive."""
+        a, b, c = self._axes
+        return a.counts, b.counts, c.counts
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:

@@ -36,18 +36,27 @@ def answered_sync(row: AxisRow) -> int:
     return row.syncs - (not row.between and not row.prompt and row.sampled < row.syncs - 1)
 
 
-def is_late(row: AxisRow, sampled: int) -> bool:
-    """Whether a position that answers the SYNC `sampled` is later in its cycle than the answer before.
-
-    A drive that always answers after the read is not late.
-    """
-    return row.prompt and row.between and sampled > row.sampled
+def unanswered(row: AxisRow) -> int:
+    """Return the number of unanswered SYNCs. The newest SYNC is not counted while its answer is not yet due."""
+    return row.syncs - row.sampled - (not row.prompt)
 
 
 def accept_answer(row: AxisRow, sampled: int) -> None:
-    """Store that a position has arrived which answers the SYNC `sampled`."""
+    """Store that a position has arrived which answers the SYNC `sampled`, and count answers that are late or lost."""
+    row.lost += max(0, sampled - row.sampled - 1)
+    row.late += row.prompt and row.between and sampled > row.sampled  # a drive that always answers later is not late
     row.came, row.prompt = True, not row.between and sampled == row.syncs
     row.sampled = sampled
+
+
+def turns_back(row: AxisRow, counts: int) -> bool:
+    """Whether a received position [counts] lies in the opposite direction to the last step."""
+    return (counts < row.newest and row.step > 0) or (counts > row.newest and row.step < 0)
+
+
+def is_far(row: AxisRow, counts: int) -> bool:
+    """Whether a received position [counts] and the one before it must come from two sliders, if no SYNC is between."""
+    return abs(counts - row.newest) > row.far_apart
 
 
 def accept_counts(row: AxisRow, counts: int, now: float) -> None:

@@ -56,7 +56,8 @@ class OdriveAxis(Axis):
         in_state = wanted is not None and self.requested is wanted and self.state == wanted and self.state_is_current
         well = self.reported and not self.errors and self.event is None and self.reset_until == -math.inf
         follows = self.powered_up or wanted is AxisState.IDLE
-        return in_state and well and follows and self.configured and self.missed == 0 and math.isfinite(self.position)
+        answers = self.configured and self.missed < self.missed_limit and math.isfinite(self.position)
+        return in_state and well and follows and answers
 
     @property
     def heartbeat_state(self) -> tuple[int, int]:

@@ -170,7 +170,6 @@ class Odrive(Driver[OdriveAxis]):
             (a.position, b.position, c.position),
             (a.power(on and not a.left_out), b.power(on and not b.left_out), c.power(on and not c.left_out)),
             self._wire.fault,
-            (a.counts, b.counts, c.counts),
             self._wire.warnings(),
             (a.age, b.age, c.age),
             homed=(a.homed, b.homed, c.homed),

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from trirail_drivers.connection.opening import connect
 from trirail_drivers.interface import (
     NAMES,
+    Counts,
     DriveFault,
     DriveGroup,
     Feedback,
@@ -298,6 +299,11 @@ class _RecordedDrives:
     def read(self) -> Feedback:
         """Return the recorded feedback of the current cycle; before the first cycle, return that of the first cycle."""
         return self._feedback[max(0, self._row - 1)]._replace(fault=self._fault, unready=self._unready)
+
+    @property
+    def counts(self) -> tuple[Counts, Counts, Counts]:
+        """Zeros: a recording contains no counts."""
+        return Counts(), Counts(), Counts()
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:

@@ -142,9 +142,9 @@ class Control:
         if len(runs) > 1 or (mode is Mode.STOPPING and not runs):
             return None
         run = runs[0] if runs and not follows else None
-        code = self._solve_code if run is not None else 0
-        if code and (cycle.refusal(code) or not self._waits(run)):
+        if run is not None and cycle.refusal(self._solve_code):
             return None
+        code = self._solve_code if self._waits(run) else 0
         until = min(self.lease.alive_until, self.goal_queue.due(self.modes.cycle) - 1)
         if goal is not None and not goal.released:
             until = min(until, goal.alive_until)

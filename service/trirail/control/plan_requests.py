@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -289,12 +289,15 @@ class PlanRequests:
         schedule = self._schedule
         if planned.first is not None and schedule.cycle < planned.first:
             return None  # not due yet
+        if planned.first is not None and schedule.cycle > planned.first:
+            self._request = None  # too late
+            return None
         run = self._planned_run or unpack_run(self._legs, planned.run)
         run.marks.append(self._marks(planned.switches))
         runs = deque([run])
         if planned.reply.stops_first and schedule.runs:
             runs.appendleft(self._stopping(schedule.runs[0], planned))
-        if planned.first not in (None, schedule.cycle) or not self._continues(runs):
+        if not self._continues(runs):
             self._request = None
             return None
         schedule.replace_runs(runs)
@@ -314,17 +317,19 @@ class PlanRequests:
             run.change_law(unpack_law(planned.stop), 0.0)
         return run
 
-    def _continues(self, runs: Iterable[Run]) -> bool:
+    def _continues(self, runs: Sequence[Run]) -> bool:
         """Return True if the runs continue the commanded motion and each other without a jump."""
         # A trajectory may begin with an acceleration from rest, because the planner has checked the resulting jerk.
         state = self._schedule.commanded
-        for run in runs:
+        for number, run in enumerate(runs):
+            if number:
+                before = runs[number - 1]
+                state = rest(before.state(before.end_time - before.time, state.pose).pose)
             begins = run.state(0.0, state.pose)
             if state.at_rest:
                 state = state._replace(acceleration=begins.acceleration)
             if not _same(begins, state):
                 return False
-            state = rest(run.state(run.end_time - run.time, state.pose).pose)
         return True
 
     def _marks(self, switches: bytes) -> GoalMarks:

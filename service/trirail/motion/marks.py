@@ -24,6 +24,7 @@ BISECTIONS = 50
 """Number of bisection steps after which an interval between samples is narrower than the resolution of a float."""
 LEAST_LENGTH = 1e-9
 """Length of a path below which the tool counts as stationary [m]."""
+_NO_SWITCHES: Final[NDArray[np.void]] = np.zeros(0, SWITCH)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
@@ -58,7 +59,7 @@ def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[
 
     """
     if not marks:
-        return Placed(np.zeros(0, SWITCH), ())
+        return Placed(_NO_SWITCHES, ())
     trace = _Trace(path, legs, start)
     rows: list[tuple[float, float, int, int]] = []
     placed = []
@@ -89,9 +90,9 @@ class GoalMarks:
         self.begin = 0.0
         """Time along the path of the run at which the path of this goal begins [s]."""
         self._marks = tuple(marks)
-        self._rows = np.frombuffer(switches, SWITCH)
+        self._rows = np.frombuffer(switches, SWITCH) if switches else _NO_SWITCHES
         self._passed = np.zeros(len(self._rows), np.bool)
-        if not (np.isfinite(self._rows["s"]).all() and np.all(self._rows["mark"] < len(self._marks))):
+        if switches and not (np.isfinite(self._rows["s"]).all() and np.all(self._rows["mark"] < len(self._marks))):
             raise ValueError(f"switches that do not belong to the {len(self._marks)} marks of goal {goal!r}")
 
     @property

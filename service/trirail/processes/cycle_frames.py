@@ -136,8 +136,10 @@ def _signed(number: int) -> int:
 _count_sync: Any = compiled()(row_updates.count_sync)
 _end_reading: Any = compiled()(row_updates.end_reading)
 _answered_sync: Any = compiled()(row_updates.answered_sync)
-_is_late: Any = compiled()(row_updates.is_late)
+_unanswered: Any = compiled()(row_updates.unanswered)
 _accept_answer: Any = compiled()(row_updates.accept_answer)
+_turns_back: Any = compiled()(row_updates.turns_back)
+_is_far: Any = compiled()(row_updates.is_far)
 _accept_counts: Any = compiled()(row_updates.accept_counts)
 _accept_turns: Any = compiled()(row_updates.accept_turns)
 _accept_statusword: Any = compiled()(row_updates.accept_statusword)
@@ -149,28 +151,23 @@ _put_outputs: Any = compiled()(row_updates.put_outputs)
 
 
 @compiled()
-def _answers_in_time(axis: Any) -> bool:
-    """Store that a position has arrived in time.
-
-    Return False, and store nothing, if the SYNC was answered before, or if an answer was late or lost.
-    """
-    sampled = _answered_sync(axis)
-    if axis.came or _is_late(axis, sampled) or sampled - axis.sampled > 1:
-        return False
-    _accept_answer(axis, sampled)
-    return True
-
-
-@compiled()
 def _accept_position(axis: Any, frame: NDArray[np.uint8], at: int, now: float) -> bool:
-    """Store the position at an offset of a frame. Return False, and store nothing, if Python must handle the frame."""
-    turns = float(frame[at : at + 4].view(np.float32)[0])
-    if (axis.floats and not math.isfinite(turns)) or not _answers_in_time(axis):
-        return False
+    """Store the position at an offset of a frame.
+
+    Return False, and store nothing, if Python must handle the frame: the position is not finite, or it is the second in
+    this cycle and may come from another node.
+    """
     if axis.floats:
+        turns = float(frame[at : at + 4].view(np.float32)[0])
+        if not math.isfinite(turns):
+            return False
         _accept_turns(axis, turns)
     else:
-        _accept_counts(axis, _signed(_number(frame, at, 4)), now)
+        counts = _signed(_number(frame, at, 4))
+        if axis.came and (_turns_back(axis, counts) or _is_far(axis, counts)):
+            return False
+        _accept_counts(axis, counts, now)
+    _accept_answer(axis, _answered_sync(axis))
     return True
 
 
@@ -186,7 +183,7 @@ def process_frames(
     """Process received frames up to the first unexpected frame; return the number of processed frames.
 
     A frame is unexpected if its identifier, its length or its masked data match no row of `expected`, or if its
-    position did not arrive in time. The caller passes the unexpected frame and all later frames to Python.
+    position may come from another node. The caller passes the unexpected frame and all later frames to Python.
 
     Parameters
     ----------
@@ -234,14 +231,13 @@ def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
 
 @compiled(i8(AXES, TIMINGS, f8[:, ::1], f8))
 def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, now: float) -> int:
-    """Conclude the reading of a cycle's frames if every drive has sent all its frames and follows its setpoints.
+    """Conclude the reading of a cycle's frames if no drive is silent for too long and all follow their setpoints.
 
     Return True in that case; otherwise change nothing and return False.
     """
     for i in range(3):
         axis = axes[i]
-        age = axis.syncs - axis.sampled
-        if age - (not axis.prompt) or now - axis.heard > axis.heard_within:
+        if _unanswered(axis) >= axis.missed_limit or now - axis.heard > axis.heard_within:
             return False
         if now - axis.status_heard > axis.status_within:
             return False

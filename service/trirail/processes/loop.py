@@ -34,7 +34,7 @@ DECISION_BUDGET_NS = 300_000
 If less time is left, the requests wait until the setpoints of the next cycle have been sent.
 """
 REPORT_BUDGET_NS = 150_000
-"""Shortest time that must be left before the next tick to send events and answers [ns]."""
+"""Shortest time that must be left before the next tick to send events and answers, or a batch of records [ns]."""
 BUDGET_DECAY = 1 / 32
 """Fraction by which a budget shrinks each time the work takes less time than the budget."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
@@ -109,6 +109,7 @@ class Loop:
         self._urgent_flag = UrgentFlag(heartbeats)
         self._decision_budget = TimeBudget(DECISION_BUDGET_NS, self._period_ns)
         self._report_budget = TimeBudget(REPORT_BUDGET_NS, self._period_ns)
+        self._flush_budget = TimeBudget(REPORT_BUDGET_NS, self._period_ns)
         self._poll_set = PollSet(ports)
         self._never_listens = self._period_ns <= SPARE_NS
         self._listened = self._never_listens
@@ -174,7 +175,7 @@ class Loop:
             self._serve_call(ticker)
         elif quiet is not None:
             self._listened = self._never_listens
-            if newest.called or self._postponed or self._reports.full:
+            if newest.called or self._postponed or not self._reports.due_after:
                 self._decide(newest.deadline_ns + self._period_ns, newest.called)
                 quiet.add(Part.DECIDE)
 
@@ -251,8 +252,11 @@ class Loop:
             else:
                 self._reports_postponed = True
                 self._reports.postpone()
-        if self._reports.full:
-            self._flush()
+        if not self._reports.due_after:
+            began_ns = self._now()
+            if self._reports.full or next_ns - began_ns >= self._flush_budget.ns:
+                self._flush()
+                self._flush_budget.note(self._now() - began_ns)
 
     def _send_reports(self) -> None:
         """Send events and answers, and receive the recorder's messages."""

@@ -21,8 +21,6 @@ from trirail.wire.links import Port
 from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import MODES
 
-_MAX_CYCLES = 1 << 40
-"""Maximum number of cycles per call. It is larger than any batch, so that the batch ends the call."""
 _NO_CYCLE = 1 << 62
 """Number of a cycle that is never reached."""
 _IDLE_LAW = constant_law(1.0)
@@ -114,7 +112,7 @@ class QuietCycles:
         watch, before = self._watch, control.cycles
         state.injected_ns, state.deadline_ns = ticker.sleep_if_injected(), ticker.deadline_ns
         state.overruns, state.in_a_row, state.allowed = overruns.all, overruns.in_a_row, overruns.allowed
-        state.until = before + (1 if once or state.injected_ns >= 0 else _MAX_CYCLES)
+        state.until = before + (1 if once or state.injected_ns >= 0 else max(1, self._reports.due_after))
         state.batched, state.listens = self._reports.batched, listens
         state.gateway_seen, state.gateway_turns = watch.seen, watch.silent_turns
         state.urgent_seen = self._urgent_flag.seen
@@ -152,7 +150,7 @@ class QuietCycles:
         if self._lent is not None and not self._decided:
             return True
         self._steady, orders = self._control.steady_state(), self._control.modes.orders
-        if self._steady is None or self._steady.until <= self._control.cycles:
+        if self._steady is None:
             return False
         if orders != self._orders:
             self.leave()

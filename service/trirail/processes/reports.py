@@ -35,6 +35,8 @@ from trirail.wire.vocabulary import MODES
 
 BATCHES_PER_SECOND = 50
 ANSWERS_A_CYCLE = 8
+SPARE_SHARE = 8
+"""A batch is due one part in SPARE_SHARE before it is full, so that it can wait while decisions leave no time."""
 PROGRESS_EVERY = 0.1
 """Minimum interval between two progress reports while drives are being configured [s]."""
 INPUTS_KEPT = 8
@@ -121,8 +123,13 @@ class Reports:
         self.batched += 1
 
     @property
+    def due_after(self) -> int:
+        """Number of cycles after which the batch is due to be sent; 0 if it is due now."""
+        return max(0, self._batch_size - self._batch_size // SPARE_SHARE - self.batched)
+
+    @property
     def full(self) -> bool:
-        """True if the batch is full and must be sent."""
+        """True if the batch has no space for another record, and must be sent."""
         return self.batched == self._batch_size
 
     @property
@@ -252,7 +259,7 @@ class Reports:
     def _publish_status(self) -> None:
         """Send the status to the gateway and the recorder, if it has changed."""
         control, goal = self._control, self._control.ledger.goal
-        goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
+        goal_id, counts = goal.id if goal else None, self._drives.counts
         fault, lag = quoted(control.fault) if control.fault else None, goal.lag if goal else None
         fields = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
         status = Status(*fields, self._unrecorded, tuple(map(quoted, control.measured.unready)))
