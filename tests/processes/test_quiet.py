@@ -70,7 +70,7 @@ class Session:
         self.late_ns = 0
         """By how much the next tick comes late."""
         self.takes_ns = 0
-        """So long the next decision takes."""
+        """So long the decision of the next cycle takes."""
         self.room: int | None = None
         """So many frames the bus takes in the next cycle; None for all."""
         self.beats = True
@@ -175,6 +175,7 @@ class Session:
                 self.loop.turn(self.ticker)
                 turns += 1
             assert turns <= 2, "before a tick it is heard once who calls"
+            self.takes_ns = 0  # a quiet cycle may have nothing to decide
             while self.gateway.receive() is not None:
                 pass
             while (packet := self.recorder.receive()) is not None:
@@ -493,6 +494,45 @@ def test_a_position_that_comes_twice_now_and_then_is_no_second_nodes(tmp_path: P
     happens = {number: [Happening(say_once_more)] for number in range(100, 900, 37)}
     one = both_ways(CONFIG, tmp_path, lambda: happens, 900)
     assert one.loop.control.fault is None
+
+
+LOSSES = (
+    "drop tpdo2 for 1 frame",
+    "drop tpdo2 for 2 frames",
+    "delay 0.0005 tpdo2 for 1 frame",
+    "delay 0.0012 tpdo2 for 3 frames",
+)
+
+
+@pytest.mark.parametrize("protocol", CONFIGS)
+def test_lost_and_late_positions_and_a_stop_need_no_python(protocol: str, tmp_path: Path) -> None:
+    """Otherwise the first cycle that is late makes the next ones late, too."""
+    before: list[int] = []
+
+    def by_python(session: Session) -> int:
+        return session.loop.control.cycles - session.loop.quiet_cycles
+
+    def script() -> dict[int, list[Happening]]:
+        def ask(request: Request) -> Happening:
+            return Happening(lambda session: session.ask(request))
+
+        def lose(line: str) -> Happening:
+            positions = line if protocol == "cia402" else line.replace("tpdo2", "get_encoder_estimates")
+            return Happening(lambda session: session.drives.faults.add(positions))
+
+        happens = {30: [ask(CommandRequest(1, "ann", Command.ENABLE))]}
+        happens[299] = [Happening(lambda session: before.append(by_python(session)))]
+        for number, x in enumerate((0.05, -0.05, 0.05, -0.05)):
+            begin = 300 + 300 * number
+            happens[begin] = [ask(GoalRequest(10 + number, "ann", f"g{number}", PoseGoal(x, 0.0, 0.0), 0))]
+            for k, line in enumerate(LOSSES):
+                happens[begin + 60 + 20 * k] = [lose(f"{'ABC'[k % 3]} {line}")]
+            happens[begin + 150] = [ask(CommandRequest(20 + number, "ann", Command.STOP))]
+        return happens
+
+    session = both_ways(CONFIGS[protocol], tmp_path, script, CYCLES)
+    assert sum(counts.feedback_lost for counts in session.driver.counts) >= 12
+    assert by_python(session) <= before[0] + 4
 
 
 def test_a_simulated_time_may_be_ahead_of_the_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

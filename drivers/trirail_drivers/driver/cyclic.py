@@ -110,6 +110,9 @@ class Cyclic:
 class Lender(Protocol):
     """DriveGroup that lends its tables to compiled code, which then runs the cycles."""
 
+    next_sync: float
+    """See DriveGroup."""
+
     def lend(self) -> Cyclic | None:
         """Return the tables between two cycles, or None if the tables do not suffice for the next cycle.
 

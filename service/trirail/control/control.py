@@ -68,7 +68,7 @@ class SteadyState(NamedTuple):
     code: int
     """Result of trirail.control.cycle.command in the latest cycle."""
     until: float
-    """Last cycle that can run without Python."""
+    """Cycle after which Python must decide. If it has passed, Python must decide after every cycle."""
     settles_by: int | None
     """Cycle in which the in-position time-out of the current goal elapses; None if no goal is settling."""
 
@@ -134,7 +134,7 @@ class Control:
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
         follows = self._follows
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
-        if stopped_now or self.ledger.busy or self._checks.due or mode in (Mode.ENABLING, Mode.HOMING):
+        if stopped_now or mode in (Mode.ENABLING, Mode.HOMING):
             return None
         if self.outputs.any:
             self.outputs.follow_mode(mode)
@@ -148,6 +148,8 @@ class Control:
         until = min(self.lease.alive_until, self.goal_queue.due(self.modes.cycle) - 1)
         if goal is not None and not goal.released:
             until = min(until, goal.alive_until)
+        if self.ledger.busy or self._checks.due:
+            until = self.cycles
         held = mode not in (Mode.DISABLED, Mode.FAULT)
         return SteadyState(run, follows, held, self._at_rest, code, until, settling.ends)
 
@@ -392,6 +394,13 @@ class Control:
                 begun = coded(words, EventCode.GOAL_STARTED, goal=beginning.id, user=beginning.user)
                 self.modes.apply_event(ModeEvent.GOAL, begun, beginning)
             self._checks.step(self._place_of_check)
+        except Exception as error:  # noqa: BLE001
+            self._trip_for(error)
+
+    def prepare(self, answer: PlanAnswer | PlannerLost) -> None:
+        """Do the part of handling an answer of the planner that changes nothing; `handle` may follow cycles later."""
+        try:
+            self._planner.prepare(answer)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 

@@ -92,6 +92,8 @@ class PlanRequests:
         """Motion of the answer, unpacked when the answer arrived, so that less is left to do in the cycle when the
         motion begins.
         """
+        self._prepared: tuple[PlanAnswer, Run] | None = None
+        """Answer that has not been received yet, and its motion."""
         self._lost: str | None = None
         self._attempts = 0
         self._answer_cycles = 0
@@ -182,14 +184,22 @@ class PlanRequests:
         """Discard the rate change, because the motion has ended."""
         self._running, self._change = False, None
 
+    def prepare(self, answer: object) -> None:
+        """Unpack the motion of an answer, so that `receive` has less to do."""
+        if isinstance(answer, PreemptingMotion):
+            with contextlib.suppress(ValueError):  # an invalid motion is refused when it would begin
+                self._prepared = answer, unpack_run(self._legs, answer.run)
+
     def receive(self, answer: PlanAnswer) -> None:
         """Store the first answer to the latest request; ignore all other answers."""
         asked = self._request
         if asked is not None and (answer.number, answer.version) == (asked.number, asked.version) and not self._answer:
             self._answer, self._since = answer, None
-            if isinstance(answer, PreemptingMotion):
-                with contextlib.suppress(ValueError):  # an invalid motion is refused when it would begin
-                    self._planned_run = unpack_run(self._legs, answer.run)
+            if self._prepared is None or self._prepared[0] is not answer:
+                self.prepare(answer)
+            if self._prepared is not None and self._prepared[0] is answer:
+                self._planned_run = self._prepared[1]
+            self._prepared = None
             self._answer_cycles = self._schedule.cycle - asked.cycle
 
     def fail(self, reason: str) -> None:

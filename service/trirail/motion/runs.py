@@ -246,6 +246,12 @@ def arrival_time(law: Path, target: float, s: float) -> float:
 
 def from_ruckig(trajectory: Trajectory, in_sliders: bool = False, tool: Sequence[float] = ZERO_RATES[:2]) -> Path:
     """Convert a trajectory of Ruckig to a path of a tool. The pieces are cubics between changes of the jerk."""
+    knots, pieces = _cubics(trajectory)
+    return Path(np.array(knots), np.array(pieces), in_sliders, repeat_tool(tool, len(pieces)))
+
+
+def _cubics(trajectory: Trajectory) -> tuple[list[float], list[list[list[float]]]]:
+    """Return the knots of a trajectory of Ruckig [s], and for each piece the coefficients of each coordinate."""
     duration: float = trajectory.duration
     times = {0.0, duration}
     for profile in trajectory.profiles[0]:
@@ -259,14 +265,12 @@ def from_ruckig(trajectory: Trajectory, in_sliders: bool = False, tool: Sequence
             knots.append(time)
     if len(knots) == 1:
         knots.append(max(duration, KNOT_TOLERANCE_S))
-    states = np.array([trajectory.at_time(time) for time in knots[:-1]] + [trajectory.at_time(knots[-1])])
-    degrees = states.shape[2]
-    pieces = np.zeros((len(knots) - 1, degrees, 6))
-    pieces[:, :, 0] = states[:-1, 0]
-    pieces[:, :, 1] = states[:-1, 1]
-    pieces[:, :, 2] = states[:-1, 2] / 2.0
-    pieces[:, :, 3] = np.diff(states[:, 2], axis=0) / np.diff(knots)[:, None] / 6.0
-    return Path(np.array(knots), pieces, in_sliders, repeat_tool(tool, len(pieces)))
+    states = [tuple(zip(*trajectory.at_time(time), strict=True)) for time in knots]
+    pieces = []
+    for before, after, begin, end in zip(states[:-1], states[1:], knots[:-1], knots[1:], strict=True):
+        jerks = ((then[2] - now[2]) / (end - begin) for now, then in zip(before, after, strict=True))
+        pieces.append([[p, v, a / 2.0, jerk / 6.0, 0.0, 0.0] for (p, v, a), jerk in zip(before, jerks, strict=True)])
+    return knots, pieces
 
 
 def repeat_tool(tool: Sequence[float], number: int) -> Array:
@@ -276,10 +280,11 @@ def repeat_tool(tool: Sequence[float], number: int) -> Array:
 
 def law_from_ruckig(trajectory: Trajectory, target: float) -> Path:
     """Convert a one-dimensional trajectory of Ruckig to a law that continues at the final rate `target`."""
-    ramp = from_ruckig(trajectory)
-    last = np.zeros((1, 1, 6))
-    last[0, 0, :2] = ramp.end[0], target
-    return Path(np.append(ramp.knots, ramp.knots[-1] + LAST_PIECE_S), np.concatenate([ramp.pieces, last]))
+    knots, pieces = _cubics(trajectory)
+    end = Path(np.array(knots[-2:]), np.array(pieces[-1:])).end[0]
+    knots.append(knots[-1] + LAST_PIECE_S)
+    pieces.append([[end, target, 0.0, 0.0, 0.0, 0.0]])
+    return Path(np.array(knots), np.array(pieces))
 
 
 def joined(paths: Sequence[Path]) -> Path:

@@ -27,8 +27,6 @@ _poll: Any = types.ExternalFunction("poll", i4(types.intp, u8, i4))
 _ppoll: Any = types.ExternalFunction("ppoll", i4(types.intp, u8, types.intp, types.intp))
 
 POLLFDS = i4[:, ::1]
-SPARE_NS: Final = 500_000
-"""Time that Python needs to serve a call [ns]. If less time is left before the deadline, the next cycle serves it."""
 _MONOTONIC: Final = 1
 _ABSOLUTE: Final = 1
 """TIMER_ABSTIME of clock_nanosleep(2)."""
@@ -71,16 +69,16 @@ def called(pollfds: NDArray[np.int32]) -> bool:
     return bool(_poll(pollfds.ctypes.data, np.uint64(len(pollfds)), 0) != 0)
 
 
-@compiled(b1(i8, POLLFDS, i8[::1]), releases=True)
-def wait(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
+@compiled(b1(i8, i8, POLLFDS, i8[::1]), releases=True)
+def wait(deadline_ns: int, spare_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
     """Wait for the deadline, or until a neighbour calls. Return True if a neighbour has called.
-
-    A call less than SPARE_NS before the deadline is ignored.
 
     Parameters
     ----------
     deadline_ns : int
         Time of the monotonic clock [ns].
+    spare_ns : int
+        Time before the deadline in which calls are ignored [ns].
     pollfds : (n, 2)
         Sockets of the neighbours, as for `called`.
     moment : (2,)
@@ -88,12 +86,12 @@ def wait(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]
 
     """
     # There are two separate waits, because ppoll wakes up later after its time-out than clock_nanosleep.
-    left = deadline_ns - SPARE_NS - now_ns(moment)
+    left = deadline_ns - spare_ns - now_ns(moment)
     while left > 0:
         moment[0], moment[1] = left // _SECOND, left % _SECOND
         if _ppoll(pollfds.ctypes.data, np.uint64(len(pollfds)), moment.ctypes.data, 0) > 0:
             return True
-        left = deadline_ns - SPARE_NS - now_ns(moment)
+        left = deadline_ns - spare_ns - now_ns(moment)
     sleep(deadline_ns, moment)
     return False
 
@@ -117,13 +115,13 @@ class PollSet:
         self.refresh()
         return bool(called(self.pollfds))
 
-    def wait(self, deadline_ns: int) -> bool:
+    def wait(self, deadline_ns: int, spare_ns: int) -> bool:
         """Wait for the deadline, or until a neighbour calls. Return True if a neighbour has called.
 
-        A call less than SPARE_NS before the deadline is ignored; see the module's function `wait`.
+        A call less than `spare_ns` before the deadline is ignored; see the module's function `wait`.
         """
         self.refresh()
-        return bool(wait(deadline_ns, self.pollfds, self._moment))
+        return bool(wait(deadline_ns, spare_ns, self.pollfds, self._moment))
 
 
 class Tick(NamedTuple):
@@ -194,10 +192,10 @@ class Ticker:
         self._sleep_to_next()
         return self._now()
 
-    def listen(self, poll_set: PollSet) -> bool:
-        """Wait for the next deadline or for an early call. Return True if there is a call."""
+    def listen(self, poll_set: PollSet, spare_ns: int) -> bool:
+        """Wait for the next deadline or for a call at least `spare_ns` before it. Return True if there is a call."""
         if self._now is time.monotonic_ns:
-            return poll_set.wait(self.deadline_ns + self._period_ns - self._busy_wait_ns)
+            return poll_set.wait(self.deadline_ns + self._period_ns - self._busy_wait_ns, spare_ns)
         self._sleep_to_next()
         return poll_set.called()
 

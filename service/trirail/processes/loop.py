@@ -13,7 +13,7 @@ from trirail_drivers.interface import NAMES, DriveFault, DriveGroup, Feedback
 from trirail.config import Config
 from trirail.control.control import Control, TimedInput
 from trirail.control.modes import ModeEvent
-from trirail.processes.clock import SPARE_NS, Overruns, PollSet, Tick, Ticker
+from trirail.processes.clock import Overruns, PollSet, Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
 from trirail.processes.quiet import Reached
@@ -35,6 +35,13 @@ If less time is left, the requests wait until the setpoints of the next cycle ha
 """
 REPORT_BUDGET_NS = 150_000
 """Shortest time that must be left before the next tick to send events and answers, or a batch of records [ns]."""
+CALL_BUDGET_NS = 500_000
+"""Shortest time that must be left before the next tick to serve a call during the wait for it [ns].
+
+If less time is left, the next cycle serves the call.
+"""
+LONGEST_CALL = 0.9
+"""Limit of that time, as a fraction of the period, above which it would never be measured again."""
 BUDGET_DECAY = 1 / 32
 """Fraction by which a budget shrinks each time the work takes less time than the budget."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
@@ -111,8 +118,8 @@ class Loop:
         self._report_budget = TimeBudget(REPORT_BUDGET_NS, self._period_ns)
         self._flush_budget = TimeBudget(REPORT_BUDGET_NS, self._period_ns)
         self._poll_set = PollSet(ports)
-        self._never_listens = self._period_ns <= SPARE_NS
-        self._listened = self._never_listens
+        self._call_budget = TimeBudget(CALL_BUDGET_NS, round(LONGEST_CALL * self._period_ns))
+        self._listened = self._call_budget.ns >= self._period_ns
         """True if no further call is served before the next tick."""
         self._reports_postponed = False
         """True if events and answers have not been sent yet, because too little time was left before a tick."""
@@ -154,10 +161,11 @@ class Loop:
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._gateway.frozen or not self._planner.idle
         if quiet is not None and not disturbed:
-            newest = quiet.run(ticker, self._overruns, listens=not self._listened, once=self._postponed)
+            spare_ns, once = self._call_budget.ns, self._postponed
+            newest = quiet.run(ticker, self._overruns, spare_ns, listens=not self._listened, once=once)
         elif quiet is not None:
             quiet.leave()
-        if newest is None and not self._listened and ticker.listen(self._poll_set):
+        if newest is None and not self._listened and ticker.listen(self._poll_set, self._call_budget.ns):
             self._serve_call(ticker)
         elif newest is None:
             self.cycle(ticker.wait())
@@ -174,9 +182,9 @@ class Loop:
         elif newest.reached is Reached.CALLED:
             self._serve_call(ticker)
         elif quiet is not None:
-            self._listened = self._never_listens
-            if newest.called or self._postponed or not self._reports.due_after:
-                self._decide(newest.deadline_ns + self._period_ns, newest.called)
+            self._listened = self._call_budget.ns >= self._period_ns
+            if newest.called or newest.decides or self._postponed or not self._reports.due_after:
+                self._decide(newest.deadline_ns + self._period_ns, called=newest.called, due=newest.decides)
                 quiet.add(Part.DECIDE)
 
     def cycle(self, tick: Tick) -> None:
@@ -201,7 +209,7 @@ class Loop:
 
     def _end(self, tick: Tick) -> None:
         """Record a cycle after its setpoints have been sent, then handle its results and the waiting requests."""
-        self._listened = self._never_listens
+        self._listened = self._call_budget.ns >= self._period_ns
         next_ns = tick.deadline_ns + self._period_ns
         self._drives.next_sync = next_ns * 1e-9
         self._reports.record(tick, self._overruns.all, self._parts_ns)
@@ -220,9 +228,13 @@ class Loop:
     @property
     def _postponed(self) -> bool:
         """True if requests or reports wait because too little time was left before a tick."""
-        return self._reports_postponed or self._gateway.postponed
+        return self._reports_postponed or self._inputs_postponed
 
-    def _decide(self, next_ns: int, called: bool = True) -> None:
+    @property
+    def _inputs_postponed(self) -> bool:
+        return self._gateway.postponed or self._planner.postponed
+
+    def _decide(self, next_ns: int, *, called: bool = True, due: bool = True) -> None:
         """Handle requests and send reports before the next tick.
 
         If too little time is left, the work is postponed once, until the setpoints of the next cycle have been sent.
@@ -232,19 +244,22 @@ class Loop:
         next_ns
             Deadline of the next tick [ns].
         called
-            Whether a neighbour may have called. If it is False, and nothing was postponed, there is nothing to do.
+            Whether a neighbour may have called. If not, there is nothing to read.
+        due
+            Whether the control must decide, even if nothing has been received.
 
         """
-        waited = self._gateway.postponed
+        waited = self._inputs_postponed
         self._drives.next_sync = next_ns * 1e-9
-        if called or waited:
-            self._gateway.read()
-            began_ns = self._now()
-            in_time = waited or next_ns - began_ns >= self._decision_budget.ns
-            self.control.decide(self._noted(next_ns, self._gateway.requests() if in_time else ()))
+        if called:
+            self._read()
+        began_ns = self._now()
+        in_time = waited or next_ns - began_ns >= self._decision_budget.ns
+        if due or (in_time and self._inputs_postponed):
+            self._pass_to_control(self._noted(next_ns) if in_time else ())
             if in_time:
                 self._decision_budget.note(self._now() - began_ns)
-        if called or waited or self._reports_postponed:
+        if called or due or waited or self._reports_postponed:
             began_ns = self._now()
             if self._reports_postponed or next_ns - began_ns >= self._report_budget.ns:
                 self._send_reports()
@@ -258,6 +273,11 @@ class Loop:
                 self._flush()
                 self._flush_budget.note(self._now() - began_ns)
 
+    def _pass_to_control(self, inputs: Iterable[TimedInput]) -> None:
+        self.control.decide(inputs)
+        if self._quiet is not None:
+            self._quiet.decided = True
+
     def _send_reports(self) -> None:
         """Send events and answers, and receive the recorder's messages."""
         self._reports_postponed = False
@@ -267,15 +287,22 @@ class Loop:
     def _serve_call(self, ticker: Ticker) -> None:
         """Handle requests that arrived during the wait for the next tick, so that they take effect at that tick."""
         self._listened = True
-        self._drives.next_sync = (ticker.deadline_ns + self._period_ns) * 1e-9
-        self._gateway.read()
-        if inputs := list(self._noted(ticker.deadline_ns + self._period_ns, self._gateway.requests(), waiting=True)):
-            self.control.decide(inputs)
+        began_ns, next_ns = self._now(), ticker.deadline_ns + self._period_ns
+        self._drives.next_sync = next_ns * 1e-9
+        self._read()
+        if inputs := list(self._noted(next_ns, waiting=True)):
+            self._pass_to_control(inputs)
         self._send_reports()
+        self._call_budget.note(self._now() - began_ns)
 
-    def _noted(self, now_ns: int, requests: Iterable[Request], *, waiting: bool = False) -> Iterator[TimedInput]:
+    def _read(self) -> None:
+        """Read the neighbours' packets, without any effect on the control."""
+        self._gateway.read()
+        self._planner.read(self.control.prepare)
+
+    def _noted(self, now_ns: int, *, waiting: bool = False) -> Iterator[TimedInput]:
         """Yield the requests and the planner's answers, each with the time `now_ns`, and note each for the recorder."""
-        for what in itertools.chain(requests, self._planner.answers()):
+        for what in itertools.chain(self._gateway.requests(), self._planner.answers()):
             self._reports.note(now_ns, what, waiting=waiting)
             yield what, now_ns
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import msgspec
@@ -102,6 +102,12 @@ class PlannerLink:
         self._port = port
         self._awaited: int | None = None
         self._unsent: str | None = None
+        self._in_hand: list[PlanAnswer | PlannerLost] = []
+
+    @property
+    def postponed(self) -> bool:
+        """True if answers have been read but not handled."""
+        return bool(self._in_hand)
 
     @property
     def idle(self) -> bool:
@@ -109,7 +115,7 @@ class PlannerLink:
         return self._unsent is None
 
     def request_plan(self, request: PlanRequest) -> None:
-        """Send a request to the planner. If that fails, `answers` reports the failure in the next cycle."""
+        """Send a request to the planner. If that fails, `read` reports the failure in the next cycle."""
         if not self._port.connected:
             self._unsent = "the planner is not running and is being restarted"
         elif not self._port.send(encode(request)):
@@ -118,6 +124,17 @@ class PlannerLink:
             self._awaited = request.number
 
     def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
+        """Yield the answers and reports that have been read but not handled."""
+        while self._in_hand:
+            yield self._in_hand.pop(0)
+
+    def read(self, prepare: Callable[[PlanAnswer | PlannerLost], None]) -> None:
+        """Read the planner's answers, and reports that a request was lost, and call `prepare` with each of them."""
+        for answer in self._received():
+            prepare(answer)
+            self._in_hand.append(answer)
+
+    def _received(self) -> Iterator[PlanAnswer | PlannerLost]:
         """Yield the planner's answers, and reports that a request was lost. Ignore answers without a request."""
         if self._unsent is not None:
             unsent, self._unsent = self._unsent, None

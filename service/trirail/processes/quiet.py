@@ -24,7 +24,7 @@ from trirail_drivers.driver.cyclic import MOST_FRAMES
 from trirail.control import cycle, outputs
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
-from trirail.processes.clock import POLLFDS, SPARE_NS, busy_wait, called, now_ns, sleep, wait
+from trirail.processes.clock import POLLFDS, busy_wait, called, now_ns, sleep, wait
 from trirail.processes.cycle_frames import (
     AXES,
     EXPECTATIONS,
@@ -189,7 +189,7 @@ def _wait(state: NDArray[np.void], moment: NDArray[np.int64], pollfds: NDArray[n
         return bool(state[0].listens and called(pollfds))
     wake_ns = state[0].deadline_ns - state[0].busy_wait_ns
     if state[0].listens:
-        return bool(wait(wake_ns, pollfds, moment))
+        return bool(wait(wake_ns, state[0].spare_ns, pollfds, moment))
     sleep(wake_ns, moment)
     return False
 
@@ -226,7 +226,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
         s.deadline_ns -= s.period_ns
         s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
         return Reached.CALLED
-    s.listens, s.sent, s.called = s.period_ns > SPARE_NS, 0, called(neighbours.pollfds)
+    s.listens, s.sent, s.called, s.decides = s.period_ns > s.spare_ns, 0, called(neighbours.pollfds), False
     # The frames that have arrived answer the previous SYNC. Nothing is left to do between the deadline and SYNC.
     if not _receive(s, moment, frames, _now_ns(state, moment) / 1e9):
         return Reached.WAITED
@@ -322,7 +322,7 @@ def _solve(
         )
     monitored = robot.monitored[0]
     in_position = s.settles and (monitored.inside >= monitored.dwell or s.cycle + 1 >= s.timeout)
-    s.called, s.code = in_position or s.called or code != s.code or s.cycle + 1 >= s.due, code
+    s.decides, s.code = in_position or code != s.code or s.cycle + 1 >= s.due, code
     late = _now_ns(state, moment) / 1e9 - s.synced > s.period
     if code >> 2 != 0 or late or not set_frames(frames.setpoints, frames.axes, robot.sliders[0]):
         return Reached.SOLVED
@@ -344,7 +344,7 @@ def _switch_outputs(
         *(tables.switches, tables.planned, tables.words, tables.log, s.logged, motion.law_knots, motion.law_pieces),
         *(s.source == COMMAND, s.time, s.period, s.cycle + 1, s.deadline_ns, record),
     )
-    s.called = s.called or s.logged >= outputs.TABLE_LENGTH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
+    s.decides = s.decides or s.logged >= outputs.TABLE_LENGTH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
     for i in range(3):
         axes[i].outputs = record[0].outputs[i] = tables.words[i]
     return True
@@ -404,6 +404,6 @@ def run(
         _mark(state, moment, Part.RECORD)
         if not accepted:
             return Reached.WRITTEN
-        if s.called:
+        if s.called or s.decides:
             return Reached.DONE
     return Reached.DONE

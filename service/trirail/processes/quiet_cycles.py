@@ -39,7 +39,9 @@ class QuietResult(NamedTuple):
     marked_ns: int
     """Time at which the newest part of the cycle ended [ns]."""
     called: bool
-    """True if a neighbour has called, or if a decision is due."""
+    """True if a neighbour has called."""
+    decides: bool
+    """True if a decision is due."""
     behind: int
     """Result of trirail.control.cycle.observe, if the cycle stopped after that function."""
     code: int
@@ -76,8 +78,8 @@ class QuietCycles:
         self._lent: Cyclic | None = None
         self._orders = 0
         """Number of orders that the control had given to the drives when the drives lent their tables."""
-        self._decided = False
-        """True if Python may have changed the motion or the mode since the arguments were prepared."""
+        self.decided = False
+        """True if the control may have changed the motion or the mode since the arguments were prepared."""
         self._steady: SteadyState | None = None
         self._tables: tuple[Any, ...] = ()
         self._motion: tuple[Any, ...] = ()
@@ -92,13 +94,17 @@ class QuietCycles:
         state.gateway_place, state.gateway_patience = PROCESSES.index("gateway"), watch.patience
         state.report_after, state.busy_wait_ns = control.outputs.report_after, busy_wait_ns
 
-    def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool, once: bool) -> QuietResult | None:
+    def run(
+        self, ticker: Ticker, overruns: Overruns, spare_ns: int, *, listens: bool, once: bool
+    ) -> QuietResult | None:
         """Run cycles until an event or the end of a batch, and return the result for the newest cycle.
 
         Return None if no cycle was run, because Python must run the next cycle.
 
         Parameters
         ----------
+        spare_ns
+            Time before a tick in which calls are not served [ns].
         listens
             True if a call during the wait for the first tick must be served before that tick.
         once
@@ -113,7 +119,7 @@ class QuietCycles:
         state.injected_ns, state.deadline_ns = ticker.sleep_if_injected(), ticker.deadline_ns
         state.overruns, state.in_a_row, state.allowed = overruns.all, overruns.in_a_row, overruns.allowed
         state.until = before + (1 if once or state.injected_ns >= 0 else max(1, self._reports.due_after))
-        state.batched, state.listens = self._reports.batched, listens
+        state.batched, state.listens, state.spare_ns = self._reports.batched, listens, spare_ns
         state.gateway_seen, state.gateway_turns = watch.seen, watch.silent_turns
         state.urgent_seen = self._urgent_flag.seen
         state.logged, state.report_due = control.outputs.logged, control.outputs.report_due
@@ -124,17 +130,16 @@ class QuietCycles:
         self._reports.batched, ticker.deadline_ns = state.batched, state.deadline_ns
         self.cycles += state.cycle - before
         control.outputs.update_log(state.logged, state.report_due)
-        decides = state.called and reached in (Reached.WRITTEN, Reached.DONE)
-        called = decides or reached is Reached.CALLED
-        self._decided = self._decided or called or once
+        decides = state.decides and reached in (Reached.WRITTEN, Reached.DONE)
         if reached not in (Reached.DONE, Reached.CALLED):
             synced = state.synced if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
             self.leave(state.handled, state.arrived, synced=synced, error=max(state.error, 0))
+        self._drives.next_sync = (state.deadline_ns + state.period_ns) * 1e-9  # for commands at the end of a motion
         control.resume(state.cycle, state.time, state.code if decides else None)
         if reached is Reached.WRITTEN:
             self._drives.send_on(state.sent)
         tick = state.deadline_ns, state.lateness_ns, state.missed
-        return QuietResult(reached, *tick, state.marked_ns, called, state.behind, state.code)
+        return QuietResult(reached, *tick, state.marked_ns, state.called, decides, state.behind, state.code)
 
     def leave(self, handled: int = 0, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Return lent tables to the drives, with the parameters of trirail_drivers.driver.cyclic.Lender.reclaim."""
@@ -147,7 +152,7 @@ class QuietCycles:
 
         The drives lend their tables until a decision of the control concerns the drives, and not only the motion.
         """
-        if self._lent is not None and not self._decided:
+        if self._lent is not None and not self.decided:
             return True
         self._steady, orders = self._control.steady_state(), self._control.modes.orders
         if self._steady is None:
@@ -160,7 +165,7 @@ class QuietCycles:
         if self._lent is not None:
             self._write_state(self._steady)
             self._motion = self._motion_arguments(self._steady.run)
-            self._decided = False
+            self.decided = False
         return self._lent is not None
 
     def add(self, part: Part) -> None:

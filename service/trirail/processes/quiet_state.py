@@ -53,7 +53,11 @@ class QuietState(ctypes.Structure):
     """Last cycle that may be run."""
     due: int
     """Cycle after which a decision is due."""
+    spare_ns: int
+    """Time before a tick in which calls are not served [ns]."""
     called: bool
+    """Whether a neighbour has called before the newest cycle."""
+    decides: bool
     """Whether a decision is due after the newest cycle."""
     mode: int
     """Number of the mode, as in a record."""
