@@ -761,7 +761,7 @@ def test_a_killed_recorder_does_not_matter(service: Service) -> None:
     log = service.log.read_text()
     assert "the recorder has died (killed by SIGKILL)" in log
     # Each recorder has a file. A busy machine may freeze another one, which the supervisor then replaces, too.
-    assert len(list((service.folder / "recordings").glob("*.rrd"))) == 1 + log.count("the recorder has died")
+    assert len(list((service.folder / "recordings").glob("*.rrd"))) == 1 + log.count("the recorder has died (")
 
 
 @pytest.mark.core

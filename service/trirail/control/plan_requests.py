@@ -92,8 +92,8 @@ class PlanRequests:
         """Motion of the answer, unpacked when the answer arrived, so that less is left to do in the cycle when the
         motion begins.
         """
-        self._prepared: tuple[PlanAnswer, Run] | None = None
-        """Answer that has not been received yet, and its motion."""
+        self._prepared: tuple[object, Run | None] = None, None
+        """Latest answer that has been prepared, and its motion."""
         self._lost: str | None = None
         self._attempts = 0
         self._answer_cycles = 0
@@ -186,6 +186,7 @@ class PlanRequests:
 
     def prepare(self, answer: object) -> None:
         """Unpack the motion of an answer, so that `receive` has less to do."""
+        self._prepared = answer, None
         if isinstance(answer, PreemptingMotion):
             with contextlib.suppress(ValueError):  # an invalid motion is refused when it would begin
                 self._prepared = answer, unpack_run(self._legs, answer.run)
@@ -195,11 +196,9 @@ class PlanRequests:
         asked = self._request
         if asked is not None and (answer.number, answer.version) == (asked.number, asked.version) and not self._answer:
             self._answer, self._since = answer, None
-            if self._prepared is None or self._prepared[0] is not answer:
+            if self._prepared[0] is not answer:
                 self.prepare(answer)
-            if self._prepared is not None and self._prepared[0] is answer:
-                self._planned_run = self._prepared[1]
-            self._prepared = None
+            _, self._planned_run = self._prepared
             self._answer_cycles = self._schedule.cycle - asked.cycle
 
     def fail(self, reason: str) -> None:
