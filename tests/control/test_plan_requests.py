@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from trirail.control.goal_queue import MAX_PASSES
 from trirail.motion.feasibility import SampleResult
 from trirail.motion.motion_planner import MotionPlanner, revision
+from trirail.motion.packing import unpack_run
 from trirail.motion.paths import Path
 from trirail.motion.runs import nominal_motion
 from trirail.motion.time_scaling import TimeScaling
@@ -336,14 +337,18 @@ GARBAGE = [
 
 @pytest.mark.parametrize("place", ["path", "law"])
 @pytest.mark.parametrize("garbage", GARBAGE)
+@pytest.mark.parametrize("prepared", [False, True])
 def test_garbage_is_refused_and_the_motion_goes_on(
-    rig: ControlRig, meddler: Meddler, garbage: PackedPath, place: str
+    rig: ControlRig, meddler: Meddler, garbage: PackedPath, place: str, prepared: bool
 ) -> None:
     moving(rig)
 
     def spoilt(answer: PlanAnswer) -> list[PlanAnswer]:
         assert isinstance(answer, PreemptingMotion)
-        return [msgspec.structs.replace(answer, run=msgspec.structs.replace(answer.run, **{place: garbage}))]
+        spoilt = msgspec.structs.replace(answer, run=msgspec.structs.replace(answer.run, **{place: garbage}))
+        if prepared:
+            rig.control.prepare(spoilt)
+        return [spoilt]
 
     meddler.change = spoilt
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
@@ -351,6 +356,45 @@ def test_garbage_is_refused_and_the_motion_goes_on(
     assert rig.outcomes() == [("g2", "rejected"), ("g1", "done")]
     assert code(rig) in ("planner_lost", "no_plan")
     assert rig.control.fault is None
+
+
+def test_an_error_while_an_answer_is_prepared_stops_the_robot_only_once_it_is_handled(
+    rig: ControlRig, meddler: Meddler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moving(rig)
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("no memory")
+
+    def prepared(answer: PlanAnswer) -> list[PlanAnswer]:
+        rig.control.prepare(answer)
+        assert rig.mode is Mode.MOVING
+        return [answer]
+
+    meddler.change = prepared
+    monkeypatch.setattr("trirail.control.plan_requests.unpack_run", fail)
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(lambda: rig.mode is Mode.FAULT)
+    assert "no memory" in str(rig.control.fault)
+
+
+def test_a_prepared_answer_is_unpacked_once(rig: ControlRig, meddler: Meddler, monkeypatch: pytest.MonkeyPatch) -> None:
+    moving(rig)
+    unpacked: list[object] = []
+
+    def noting(*given: Any) -> Any:
+        unpacked.append(given)
+        return unpack_run(*given)
+
+    def prepared(answer: PlanAnswer) -> list[PlanAnswer]:
+        rig.control.prepare(answer)
+        return [answer]
+
+    meddler.change = prepared
+    monkeypatch.setattr("trirail.control.plan_requests.unpack_run", noting)
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(rig.holds)
+    assert len(unpacked) == 1
 
 
 def test_a_jog_whose_dead_man_is_over_before_it_is_planned_does_not_begin(rig: ControlRig, meddler: Meddler) -> None:

@@ -8,6 +8,7 @@ notices.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, NamedTuple
 
@@ -399,10 +400,8 @@ class Control:
 
     def prepare(self, answer: PlanAnswer | PlannerLost) -> None:
         """Do the part of handling an answer of the planner that changes nothing; `handle` may follow cycles later."""
-        try:
+        with contextlib.suppress(Exception):  # the motion meets the same error when it begins, which stops the robot
             self._planner.prepare(answer)
-        except Exception as error:  # noqa: BLE001
-            self._trip_for(error)
 
     def handle(self, received: Request | Disturbance | PlanAnswer | PlannerLost, now_ns: int) -> None:
         """Handle one input. `now_ns` is the time on the monotonic clock at which the input was received [ns]."""

@@ -119,7 +119,7 @@ class Loop:
         self._flush_budget = TimeBudget(REPORT_BUDGET_NS, self._period_ns)
         self._poll_set = PollSet(ports)
         self._call_budget = TimeBudget(CALL_BUDGET_NS, round(LONGEST_CALL * self._period_ns))
-        self._listened = self._call_budget.ns >= self._period_ns
+        self._listened = self._never_listens
         """True if no further call is served before the next tick."""
         self._reports_postponed = False
         """True if events and answers have not been sent yet, because too little time was left before a tick."""
@@ -182,7 +182,7 @@ class Loop:
         elif newest.reached is Reached.CALLED:
             self._serve_call(ticker)
         elif quiet is not None:
-            self._listened = self._call_budget.ns >= self._period_ns
+            self._listened = self._never_listens
             if newest.called or newest.decides or self._postponed or not self._reports.due_after:
                 self._decide(newest.deadline_ns + self._period_ns, called=newest.called, due=newest.decides)
                 quiet.add(Part.DECIDE)
@@ -209,7 +209,7 @@ class Loop:
 
     def _end(self, tick: Tick) -> None:
         """Record a cycle after its setpoints have been sent, then handle its results and the waiting requests."""
-        self._listened = self._call_budget.ns >= self._period_ns
+        self._listened = self._never_listens
         next_ns = tick.deadline_ns + self._period_ns
         self._drives.next_sync = next_ns * 1e-9
         self._reports.record(tick, self._overruns.all, self._parts_ns)
@@ -229,6 +229,11 @@ class Loop:
     def _postponed(self) -> bool:
         """True if requests or reports wait because too little time was left before a tick."""
         return self._reports_postponed or self._inputs_postponed
+
+    @property
+    def _never_listens(self) -> bool:
+        """True if a call takes longer than a period, so that none is served before a tick."""
+        return self._call_budget.ns >= self._period_ns
 
     @property
     def _inputs_postponed(self) -> bool:
