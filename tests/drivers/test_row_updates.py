@@ -24,10 +24,13 @@ from trirail_drivers.driver.row_updates import (
     count_sync,
     due_setpoint,
     end_reading,
+    is_far,
     outputs_pending,
     put_outputs,
     put_setpoint,
     scale_setpoint,
+    turns_back,
+    unanswered,
 )
 from trirail_drivers.driver.scaling import Scale
 
@@ -160,6 +163,26 @@ def test_a_second_answer_to_a_sync_is_not_late() -> None:
     assert answered_sync(axis) == 1
     axis.answer()
     assert (axis.sampled, axis.late, axis.lost) == (1, 0, 0)
+
+
+NEAR = st.integers(-3, 3) | st.integers(-(2**31), 2**31 - 1)
+
+
+@given(newest=NEAR, step=NEAR, counts=NEAR, far_apart=st.integers(0, 5))
+def test_a_second_position_turns_back_against_the_last_step_and_is_far_beyond_a_distance(
+    newest: int, step: int, counts: int, far_apart: int
+) -> None:
+    axis = made()
+    axis.newest, axis.step, axis.far_apart = newest, step, far_apart
+    assert turns_back(axis, counts) == ((counts - newest) * step < 0)
+    assert is_far(axis, counts) == (counts not in range(newest - far_apart, newest + far_apart + 1))
+
+
+@given(prompt=st.booleans(), sampled=st.integers(0, 9), more=st.integers(1, 9))
+def test_an_answer_that_is_not_due_yet_is_not_missing(prompt: bool, sampled: int, more: int) -> None:
+    axis = made()
+    axis.prompt, axis.sampled, axis.syncs = prompt, sampled, sampled + more
+    assert unanswered(axis) == (more if prompt else more - 1)
 
 
 def test_an_answer_to_the_sync_before_is_not_prompt() -> None:
