@@ -16,7 +16,7 @@ from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import Loop, TimeBudget
 from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
-from trirail.processes.reports import BATCHES_PER_SECOND
+from trirail.processes.reports import BATCHES_PER_SECOND, SPARE_SHARE
 from trirail.processes.requests import MAX_COMMANDS, MAX_GOALS
 from trirail.wire import links
 from trirail.wire.event_codes import EventCode, coded
@@ -335,6 +335,37 @@ def test_on_a_slow_machine_only_the_first_report_makes_a_cycle_late(
             late += shell.took_ns > 1_000_000
     assert late == 1
     assert sum(event.outcome == "preempted" for event in shell.events()) == 10
+
+
+@pytest.mark.parametrize("busy", [0, 1, 50])
+def test_a_batch_waits_while_decisions_leave_no_time_but_becomes_no_larger(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, busy: int
+) -> None:
+    """`busy`: of 50 cycles, so many whose decisions take nearly all of the period."""
+    shell.enabled()
+    shell.received()
+    largest, decide = shell.rig.config.loop.rate_hz // BATCHES_PER_SECOND, shell.loop.control.decide
+    takes_ns = [0]
+
+    def slow_decide(inputs: Iterable[TimedInput]) -> None:
+        decide(inputs)
+        shell.took_ns += takes_ns[0]
+
+    monkeypatch.setattr(shell.loop.control, "decide", slow_decide)
+    batches: list[list[int]] = []
+    for number in range(400):
+        takes_ns[0] = 900_000 if number % 50 < busy else 0
+        shell.took_ns = 50_000
+        shell.cycles(1)
+        batches += [unpack(packet[1:])["cycle"].tolist() for packet in shell.received() if packet[0] == Kind.RECORDS]
+    cycles = [cycle for batch in batches for cycle in batch]
+    assert cycles == [*range(cycles[0], cycles[0] + len(cycles))]
+    assert len(cycles) > 400 - largest
+    sizes = {len(batch) for batch in batches[1:]}
+    due = largest - largest // SPARE_SHARE
+    assert sizes <= {*range(due, largest + 1)}
+    assert (largest in sizes) == (busy == 50)
+    assert (due in sizes) == (busy < 50)
 
 
 @pytest.mark.parametrize("last_took_ns", [200_000, 700_000])
