@@ -114,7 +114,7 @@ def test_a_process_that_goes_and_comes_back_is_counted_and_nobody_else_is_red(
         wait_readable(lasting.process, 0.02)
     lasting.wait_health(lambda wrong: not wrong)
     assert red <= {name}
-    assert lasting.restarts() == before | {name: before[name] + 1.0}
+    assert lasting.restarts() == before | {name: before[name] + 1.0}, lasting.log.read_text()
 
 
 @pytest.mark.parametrize("name", ["gateway", "planner", "recorder"])

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -77,8 +78,12 @@ class Heart:
         self._place = place
 
     def beat(self) -> None:
-        """Count a beat."""
-        self._counts[self._place] += 1
+        """Count a beat.
+
+        The first beat sets the counter to the monotonic time in nanoseconds. A restarted process therefore never
+        repeats a count of the process before it, which a watch would mistake for silence.
+        """
+        self._counts[self._place] = (self._counts[self._place] or time.monotonic_ns()) + 1
 
     def rest(self) -> None:
         """Reset the counter to 0, so that no heartbeat is expected until the next beat."""
@@ -86,7 +91,7 @@ class Heart:
 
     @property
     def count(self) -> int:
-        """Number of beats; 0 while the process is not expected to beat."""
+        """Count that every beat increases; 0 while the process is not expected to beat."""
         return self._counts[self._place]
 
 
