@@ -6,7 +6,9 @@ import itertools
 
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 from trirail.client.goal import AsyncGoalHandle, OpenGoals, Result
+from trirail.wire.marks import Switch
 from trirail.wire.messages import GoalReply
 
 IDS = ("g1", "g2")
@@ -63,3 +65,17 @@ def test_every_handle_of_an_accepted_call_ends(steps: list[tuple[str, int]]) -> 
     assert not goals
     assert not goals._calls
     assert not goals._accepted
+
+
+def test_a_restarted_gateway_repeats_switches_that_the_result_has_once() -> None:
+    goals: OpenGoals = OpenGoals()
+    goal = goals.open(handle("g1"))
+    goals.accept(goal, reply("g1"))
+    switch = Switch("g1", 0, "gripper", True, 500, 0.5, 1e9, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    later = structs.replace(switch, mark=1, value=False, cycle=600, t=0.6)
+    goals.note_switches((switch,))
+    goals.note_switches((switch,))  # from a restarted gateway, in an event that is another object
+    goals.note_switches((later,))
+    goals.end(Result("g1", "stopped", "the gateway has died: controlled stop"))
+    assert goal.result is not None
+    assert goal.result.marks == (switch, later)

@@ -129,7 +129,7 @@ class OpenGoals:
         self._handles: dict[str, AsyncGoalHandle] = {}
         self._calls: Counter[str] = Counter()
         self._accepted: set[str] = set()
-        self._switches: dict[str, list[Switch]] = {}
+        self._switches: dict[str, dict[Switch, None]] = {}
 
     def __len__(self) -> int:
         return len(self._handles)
@@ -161,10 +161,13 @@ class OpenGoals:
             handle.end(result._replace(marks=tuple(self._switches.pop(result.id, ()))))
 
     def note_switches(self, switches: Iterable[Switch]) -> None:
-        """Store output switches for the results of their goals; ignore switches of goals that are not registered."""
+        """Store output switches for the results of their goals; ignore switches of goals that are not registered.
+
+        Each switch is stored once, although a restarted gateway repeats past events.
+        """
         for switch in switches:
             if switch.goal in self._handles:
-                self._switches.setdefault(switch.goal, []).append(switch)
+                self._switches.setdefault(switch.goal, {})[switch] = None
 
     def _end_call(self, goal_id: str) -> None:
         self._calls[goal_id] -= 1
