@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import threading
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from trirail.client.blocking import Lease, LoopThread
 from trirail.client.lease import SIGNS, AsyncLease
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire.messages import CommandReply
-from trirail.wire.vocabulary import AcquireLease, Command, ReleaseLease
+from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 from waiting import WITHIN
 
 OVER = RefusedError(RefusalCode.LEASE_OVER, "it is over")
@@ -117,3 +118,22 @@ def test_who_cannot_wait_for_the_standstill_gives_it_back(loop: LoopThread) -> N
     with pytest.raises(ServiceError), Lease(AsyncLease(command, force=False, timeout=10.0), loop):
         raise AssertionError
     assert [service.next()[0] for _ in range(2)] == [Command.ACQUIRE, Command.RELEASE]
+
+
+def test_a_lease_outlasts_a_gateway_that_is_restarted_within_its_time_out() -> None:
+    """The loop still holds the lease: one of the four renewals within a time-out is enough."""
+    asked: list[Command] = []
+
+    async def command(name: Command, _content: bytes) -> CommandReply:
+        asked.append(name)
+        if len(asked) == 3:
+            raise ServiceError("no robot 'demo' answers")
+        return CommandReply(name, Mode.HOLDING, 0)
+
+    async def hold() -> None:
+        async with AsyncLease(command, force=False, timeout=2.0) as lease:
+            assert not await lease.wait(1.8)  # three renewals, of which the second meets no gateway
+            assert lease.lost is None
+
+    asyncio.run(hold())
+    assert asked == [Command.ACQUIRE] * 4 + [Command.RELEASE]

@@ -11,7 +11,7 @@ from typing import Self
 import msgspec
 
 from trirail.client.outgoing import number, seconds
-from trirail.errors import TrirailError
+from trirail.errors import ServiceError, TrirailError
 from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 
@@ -66,12 +66,17 @@ class AsyncLease:
                 await self._command(Command.RELEASE, msgspec.json.encode(ReleaseLease(self._sign.id)))
 
     async def _keep(self) -> None:
-        sign = msgspec.json.encode(self._sign)
+        sign, now = msgspec.json.encode(self._sign), asyncio.get_running_loop().time
+        until = now() + self._sign.timeout
         while True:
             await asyncio.sleep(self._sign.timeout / SIGNS)
+            sent = now()
             try:
                 await self._command(Command.ACQUIRE, sign)
+                until = sent + self._sign.timeout
             except TrirailError as error:
+                if isinstance(error, ServiceError) and now() < until:  # for example, the gateway is being restarted
+                    continue
                 self.lost = error
                 self._over.set()
                 return
