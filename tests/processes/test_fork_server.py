@@ -243,3 +243,19 @@ def test_a_frozen_parent_is_waited_for_once(parent: Parent, monkeypatch: pytest.
     for child in children[1:]:
         child.kill()
         assert parent.until_over(child) == "exit code unknown"
+
+
+def test_a_parent_that_was_late_once_is_waited_for_again(parent: Parent) -> None:
+    late = "if os.fork() == 0: time.sleep({}); os.kill(server, signal.SIGCONT); os._exit(0)\n"
+    late += "os.kill(server, signal.SIGSTOP); os._exit(7)"
+    gateway, recorder = parent.child("gateway"), parent.child("recorder")
+    for child in (gateway, recorder):
+        parent.until_said(child)
+    parent.warm.report_timeout = 0.1
+    (parent.folder / "gateway").write_text(late.format(1.0))
+    assert parent.until_over(gateway) == "exit code unknown"
+    select.select([parent.warm], [], [], WITHIN)
+    parent.warm.receive()  # it goes on, and says how the gateway has ended
+    assert gateway.returncode == 7
+    (parent.folder / "recorder").write_text(late.format(0.3))
+    assert parent.until_over(recorder) == "exit code 7"

@@ -79,7 +79,7 @@ class ForkServerLink:
         self._numbers = 0
         self._hung_for = 0.0
         self.report_timeout = IMPORT_TIMEOUT_S
-        """Maximum time to wait for the next message [s]; 0 after a wait that timed out."""
+        """Maximum time to wait for the next message [s]; 0 after a wait that timed out, until a message arrives."""
         self.gone = False
         """True if the fork server has ended. The kernel has then sent SIGTERM to the loop."""
 
@@ -108,6 +108,7 @@ class ForkServerLink:
         if not packet:
             self._on_end()
             return
+        self.report_timeout = self.report_timeout or END_REPORT_TIMEOUT_S
         message: ChildStart | ChildEnd = decoded(packet, ChildStart | ChildEnd)
         if isinstance(message, ChildStart):
             child = self._requested[message.number]
@@ -118,7 +119,10 @@ class ForkServerLink:
             self._requested.pop(message.number).ended(message.code)
 
     def wait_for_message(self) -> bool:
-        """Wait for the next message. Return False on a time-out; later calls then do not wait."""
+        """Wait for the next message. Return False on a time-out.
+
+        Later calls then do not wait, until a message arrives.
+        """
         heard = bool(select.select([self], [], [], self.report_timeout)[0])
         self.report_timeout = self.report_timeout if heard else 0.0
         return heard
