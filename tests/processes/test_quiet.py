@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import can
 import numpy as np
@@ -31,7 +31,18 @@ from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.links import Port
-from trirail.wire.packets import CommandRequest, EventReport, GoalRequest, Kind, Request, decode_answer, message
+from trirail.wire.messages import Notice
+from trirail.wire.packets import (
+    Announcement,
+    CommandRequest,
+    EventReport,
+    GoalRequest,
+    Kind,
+    Request,
+    Status,
+    decode_answer,
+    message,
+)
 from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
 from trirail.wire.vocabulary import MODES, Command, Mode
@@ -637,3 +648,32 @@ def test_an_event_belongs_to_the_first_cycle_that_it_shows_in(slow: Sequence[int
     cycles = [event[1] for event in events]
     assert cycles == sorted(cycles)
     assert cycles[-1] > begun[-1]
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_recorder_whose_loss_a_batch_notices_is_missed_at_once(quiet: bool, tmp_path: Path) -> None:
+    session = Session(CONFIG, tmp_path, "unix", quiet=quiet)
+
+    def records(session: Session) -> None:
+        session.recorder.send(message(Announcement(Notice("service", "info", "recording to x.rrd"))))
+
+    def dies(session: Session) -> None:
+        session.recorder.close()
+        session.loop._reports.flush()  # the batch of this cycle finds the socket closed
+        session.recorder = links.connect(tmp_path / "planner")  # only to have one that can be read
+        session._stack.callback(session.recorder.close)
+
+    told: list[str] = []
+    real = session.loop._reports._gateway.send
+
+    def send(packet: Any) -> bool:
+        if packet[0] == Kind.MESSAGE and isinstance(said := decode_answer(bytes(packet)[1:]), Status):
+            told.append(said.unrecorded)
+        return real(packet)
+
+    session.loop._reports._gateway.send = send  # type: ignore[method-assign]
+    try:
+        session.run({100: [Happening(records)], 205: [Happening(dies)]}, 300)
+        assert told[-1:] == ["the recorder has died: nothing is recorded until it has restarted"]
+    finally:
+        session.close()

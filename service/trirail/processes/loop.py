@@ -264,7 +264,7 @@ class Loop:
             self._pass_to_control(self._noted(next_ns) if in_time else ())
             if in_time:
                 self._decision_budget.note(self._now() - began_ns)
-        if called or due or waited or self._reports_postponed:
+        if called or due or waited or self._reports_postponed or self._reports.misses_recorder:
             began_ns = self._now()
             if self._reports_postponed or next_ns - began_ns >= self._report_budget.ns:
                 self._send_reports()

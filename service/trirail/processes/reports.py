@@ -72,6 +72,8 @@ class Reports:
         self._period = config.period
         self._welcome = Welcome(lacking, drives.bus_load, drives.missing_protections)
         self._status = Status(None, 1.0, None)
+        self._unsent_status = False
+        """True if the gateway had no space for the newest status, which is then sent with the next batch."""
         self._bus_load = 0.0
         self._traffic = drives.traffic
         self._bus_measured_at = self._progress_at = 0
@@ -142,6 +144,11 @@ class Reports:
         """Array for the records of a batch, (n, SIZE) bytes, of which the first `batched` rows are filled."""
         return np.frombuffer(self._batch, np.uint8)[1:].reshape(-1, SIZE)
 
+    @property
+    def misses_recorder(self) -> bool:
+        """True if the recorder was lost and `listen` has not announced that yet."""
+        return not self._recorder.no_peer_lost
+
     def pass_on(self) -> None:
         """Send the inputs to the control, then the events and the answers, if there are any.
 
@@ -171,6 +178,8 @@ class Reports:
         self._measure_bus_load()
         if self._control.measured.feedback.unready != self._unready:
             self._report_progress()
+        if self._unsent_status:
+            self._send_status()
         self.accept_peers()
         self._send_events()
 
@@ -264,9 +273,13 @@ class Reports:
         fields = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
         status = Status(*fields, self._unrecorded, tuple(map(quoted, control.measured.unready)))
         if status != self._status:
-            self._status, packet = status, message(status)
-            self._gateway.send(packet)
-            self._recorder.send(packet)
+            self._status = status
+            self._send_status()
+            self._recorder.send(message(status))
+
+    def _send_status(self) -> None:
+        """Send the status to the gateway. It is sent again if there is no space, because a next one may never come."""
+        self._unsent_status = not self._gateway.send(message(self._status)) and self._gateway.connected
 
     def _send_answers(self) -> None:
         """Send at most ANSWERS_A_CYCLE answers. Answers wait for a slow gateway; if the gateway is lost, drop them."""
