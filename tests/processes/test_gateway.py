@@ -58,6 +58,7 @@ class Rig:
     def __init__(self, opened: zenoh.Session) -> None:
         self.link = FakeLink()
         self.gateway = Gateway(CONFIG, self.link, lambda: None, opened, Guard(CONFIG))  # type: ignore[arg-type]
+        self.gateway._requests._tickets = 0  # so that the first ticket is 1
 
     @property
     def sent(self) -> list[Request]:

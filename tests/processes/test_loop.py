@@ -3,29 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
+import msgspec
 import pytest
 from conftest import Followers, Rig, alone, what_memory_takes
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.control.control import TimedInput
 from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
+from trirail.processes.incoming import Incoming
 from trirail.processes.loop import Loop, TimeBudget
+from trirail.processes.loop_death import LoopDeath
 from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
 from trirail.processes.reports import BATCHES_PER_SECOND, SPARE_SHARE
-from trirail.processes.requests import MAX_COMMANDS, MAX_GOALS
+from trirail.processes.requests import MAX_COMMANDS, MAX_GOALS, Requests
+from trirail.processes.session_guard import Guard
 from trirail.wire import links
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal
 from trirail.wire.links import LinkClosed, PacketLink, Port
-from trirail.wire.messages import Event, Notice
+from trirail.wire.messages import CommandReply, Event, GoalReply, Notice
 from trirail.wire.packets import (
+    Accepted,
     Announcement,
     Answer,
+    Checked,
     CommandDone,
     CommandRequest,
     ControlInput,
@@ -44,7 +52,7 @@ from trirail.wire.packets import (
 from trirail.wire.plan_packets import PreemptingMotion, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_TEXT
-from trirail.wire.vocabulary import Command, Mode, Override
+from trirail.wire.vocabulary import Command, FaultCause, Mode, Override
 from trirail_drivers.interface import DriveGroup
 
 
@@ -653,3 +661,77 @@ def test_a_gateway_that_says_what_cannot_be_read_is_let_go(shell: Shell, words: 
     assert [what.event for what in given if isinstance(what, Disturbance)] == ["GATEWAY_LOST"]
     assert shell.loop.control.fault is None
     assert shell.loop.control.state.mode is Mode.HOLDING
+
+
+# ---------------------------------------------------------------------- a gateway after another
+
+
+class Asking:
+    """The requests of a gateway, and what their senders were answered."""
+
+    def __init__(self, shell: Shell) -> None:
+        self.shell = shell
+        self.answered: dict[str, Any] = {}
+        self.requests = Requests(CONFIG, shell.gateway, Guard(CONFIG), self, LoopDeath(CONFIG.period), nullcontext)  # type: ignore[arg-type]
+
+    def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
+        self.answered[incoming.id] = content
+
+    def hear(self) -> None:
+        for said in self.shell.said():
+            if isinstance(said, CommandDone):
+                self.requests.answer(said.ticket, CommandReply(said.name, said.mode, said.cycle))
+            elif isinstance(said, Accepted | Checked):
+                self.requests.answer(said.ticket, said.reply)
+            elif isinstance(said, Refused):
+                self.requests.answer(said.ticket, said)
+
+
+def came(name: str) -> Incoming:
+    return Incoming("cmd", "trirail/demo/cmd/ann", 0, b"", "", None, 0, id=name)
+
+
+def test_a_gateway_is_not_told_what_the_gateway_before_it_was_owed(shell: Shell, tmp_path: Path) -> None:
+    moving(shell)
+    before = Asking(shell)
+    before.requests.command(came("stop"), "ann", Command.STOP, None)
+    shell.cycles(2)  # the robot brakes, which takes longer than the restart of the gateway
+    shell.gateway.close()
+    shell.cycles(21)
+    shell.gateway = links.connect(tmp_path / "gateway")
+    shell.cycles(21)
+    after = Asking(shell)
+    after.requests.check(came("check"), "ann", PoseGoal(0.0, 0.02, 0.0))
+    shell.serves = False  # the planner takes its time
+    beating(shell, 300)
+    after.hear()
+    assert after.answered == {}
+    shell.serves = True
+    beating(shell, 50)
+    after.hear()
+    assert isinstance(after.answered["check"], GoalReply)
+
+
+def test_a_status_that_changes_while_a_new_gateway_starts_reaches_it(
+    shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The past events fill the socket of a gateway that does not read yet, as large as a usual kernel allows."""
+    monkeypatch.setattr(links, "_BUFFER", 212_992)
+    shell.enabled()
+    notice = Notice("service", "info", "something happened that is told in a line of a usual length " * 3)
+    for _ in range(600):
+        shell.gateway.send(message(Announcement(notice)))
+        shell.cycles(1)
+        shell.received()
+    shell.gateway.close()
+    shell.cycles(30)
+    shell.gateway = links.connect(tmp_path / "gateway")
+    shell.cycles(100)  # it imports its modules
+    shell.loop.control.modes.trip(coded("the emergency stop is pressed", EventCode.OTHER), FaultCause.QUICK_STOP)
+    shell.cycles(300)
+    told = []
+    for _ in range(20):  # and then reads everything
+        told += [said for said in shell.said() if isinstance(said, Status)]
+        shell.cycles(30)
+    assert shell.mode() is Mode.FAULT
+    assert told[-1].fault == "the emergency stop is pressed"

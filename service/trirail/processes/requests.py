@@ -62,7 +62,8 @@ class _PendingRequest(NamedTuple):
 class Requests:
     """Forwarder of requests to the loop, and of the loop's answers to the senders of the requests.
 
-    A ticket, which is a unique number, identifies each request.
+    A ticket, which is a unique number, identifies each request. The tickets begin with the time, so that they differ
+    from those of an earlier gateway. The loop may still answer its commands after a restart.
     """
 
     def __init__(
@@ -93,7 +94,7 @@ class Requests:
         self._commands: dict[int, str] = {}
         """User of each command and check in the loop, by ticket."""
         self._pending: dict[int, _PendingRequest] = {}
-        self._tickets = 0
+        self._tickets = time.monotonic_ns()
 
     def __iter__(self) -> Iterator[Incoming]:
         """Yield the messages that have not been answered."""
