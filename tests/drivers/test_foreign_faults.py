@@ -8,10 +8,13 @@ import can
 import pytest
 from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, QUICK_STOP, STOPPED, ForeignDrive, Habits
 from drivers.test_foreign import MAKES, PERIOD, Rig
+from msgspec import structs
 from rigs import OFF, Closing, frame
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.codes import describe_error
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
+from trirail_drivers.timing import BusTiming
 
 pytestmark = pytest.mark.long
 
@@ -294,3 +297,19 @@ def test_each_way_is_what_its_name_says(closing: Closing) -> None:
         "cyclic synchronous position with velocity offset, statusword polled, heartbeat",
         "cyclic synchronous position, statusword with the position, heartbeat",
     ]
+
+
+def test_a_drive_whose_statusword_is_polled_is_asked_also_without_sync_and_setpoints(closing: Closing) -> None:
+    """As the bench provokes its watchdog, which may act long after the time-out of the statusword."""
+    make, habits = WAYS["statusword polled"]
+    rig = Rig(make, habits())
+    rig.drives = Cia402(rig.wires, BusTiming(1_000_000), structs.replace(rig.config, heartbeat=0.5), rig.clock)
+    closing(rig).ready()
+    rig.enable()
+    feedback = rig.cycles(20, rig.target)
+    for _ in range(round(2.0 / PERIOD)):
+        rig.clock.now += PERIOD
+        if (feedback := rig.drives.read()).fault is not None:
+            break
+    assert feedback.fault is not None
+    assert feedback.fault.cause == "emcy", feedback.fault.message

@@ -14,11 +14,12 @@ from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.control.control import TimedInput
+from trirail.errors import RefusalCode
 from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.incoming import Incoming
-from trirail.processes.loop import Loop, TimeBudget
+from trirail.processes.loop import CALL_BUDGET_NS, Loop, TimeBudget
 from trirail.processes.loop_death import LoopDeath
 from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
 from trirail.processes.reports import BATCHES_PER_SECOND, SPARE_SHARE
@@ -49,7 +50,7 @@ from trirail.wire.packets import (
     decode_answer,
     message,
 )
-from trirail.wire.plan_packets import PreemptingMotion, decode_plan_request, encode
+from trirail.wire.plan_packets import NotPlanned, PreemptingMotion, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override
@@ -402,6 +403,15 @@ def test_a_request_waits_a_cycle_where_the_last_one_took_longer_than_the_time_le
     assert not shell.loop._gateway.postponed
 
 
+def test_a_call_that_took_long_does_not_end_listening_for_good(shell: Shell) -> None:
+    """Behind its budget no call is served before a tick any more, and none is measured."""
+    shell.enabled()
+    shell.loop._call_budget.note(shell.loop._period_ns)
+    assert shell.loop._call_budget.ns > CALL_BUDGET_NS
+    shell.cycles(shell.rig.config.loop.rate_hz)
+    assert shell.loop._call_budget.ns == CALL_BUDGET_NS
+
+
 def test_a_machine_that_stands_still_is_no_frozen_gateway(shell: Shell) -> None:
     moving(shell)
     shell.rig.now += 0.09
@@ -597,7 +607,11 @@ def test_a_planner_that_is_not_there_costs_the_goal_and_the_next_one_is_taken(sh
 
 
 @pytest.mark.parametrize(
-    "junk", [b"", b"\x00", b"nonsense", message(Announcement(Notice("service", "info", "hello"))), b"\xff" * 1000]
+    "junk",
+    [
+        *(b"", b"\x00", b"nonsense", message(Announcement(Notice("service", "info", "hello"))), b"\xff" * 1000),
+        encode(NotPlanned(1, 1, RefusalCode.NO_PLAN, "text")).replace(b"text", b"\xff\xfe\xfd\xfc"),
+    ],
 )
 def test_what_is_no_answer_ends_the_planner_and_not_the_robot(shell: Shell, junk: bytes) -> None:
     """An empty packet is how an end looks; after anything else the loop hangs up, and the supervisor starts another."""

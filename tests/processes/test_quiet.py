@@ -566,6 +566,35 @@ def test_a_jog_that_nobody_renews_ends_also_where_its_time_is_over_within_a_cycl
     assert one.loop.control.state.mode is Mode.HOLDING
 
 
+@pytest.mark.parametrize(
+    "bad", [VelocityGoal(100.0, 0.0, 0.0, timeout=0.5), VelocityGoal(0.02, 0.0, 0.0, timeout=0.5, valid_for=0.001)]
+)
+def test_a_jog_whose_renewal_is_refused_ends_alike(bad: VelocityGoal, tmp_path: Path) -> None:
+    """The planner refuses it, or it is too old."""
+    jog = VelocityGoal(0.02, 0.0, 0.0, timeout=0.5)
+    happens = {
+        30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+        100: [Happening(lambda session: session.ask(GoalRequest(2, "ann", "jog", jog, session.now_ns)))],
+        200: [Happening(lambda session: session.ask(GoalRequest(3, "ann", "jog", bad, session.now_ns - 10_000_000)))],
+    }
+    one = both_ways(CONFIG, tmp_path, lambda: happens, 400)
+    assert one.loop.control.state.mode is Mode.HOLDING
+
+
+@pytest.mark.parametrize("protocol", CONFIGS)
+def test_that_a_fault_is_over_is_noted_in_the_same_cycle(protocol: str, tmp_path: Path) -> None:
+    """A frame of wrong length is a fault of drives that need nothing but a reset; a replay must know when it ends."""
+    position = 0x281 if protocol == "cia402" else 1 << 5 | 9
+    happens = {
+        60: [Happening(lambda session: session.inject(CAN_FRAME.pack(position, 3, b"abc")))],
+        300: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.RESET)))],
+        500: [Happening(lambda session: session.ask(CommandRequest(2, "ann", Command.ENABLE)))],
+    }
+    one = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 600)
+    assert any("wrong length" in repr(each) for each in one.heard)
+    assert one.loop.control.state.mode is Mode.HOLDING
+
+
 @pytest.mark.parametrize("quiet", [True, False])
 def test_who_stays_at_the_door_unheard_keeps_no_tick_waiting(quiet: bool, tmp_path: Path) -> None:
     """What a frozen gateway has left is not taken, and it stays there."""

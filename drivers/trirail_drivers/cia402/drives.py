@@ -75,6 +75,8 @@ class Cia402(Driver[Cia402Axis]):
         self._heartbeat_due: float | None = None
         self._wanted: canopen_frames.TargetState = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
+        self._requested_after = 0
+        """Number of SYNCs sent before the last `write`."""
         self._expected_state: list[tuple[int, int]] = []
         """Statusword and inputs of each drive for which the expected frames were last written."""
 
@@ -226,6 +228,8 @@ class Cia402(Driver[Cia402Axis]):
             fault = self._homing.step(now)
             if fault is not None:
                 self._wire.fail(fault)
+        if self._axes[0].syncs == self._requested_after:  # no SYNC since the last `write`, so no setpoints will follow
+            self._poll(now)
         return self._feedback()
 
     def _feedback(self) -> Feedback:
@@ -253,9 +257,8 @@ class Cia402(Driver[Cia402Axis]):
         """
         if not self._stopped_in_this_cycle:
             self._write_setpoints(position, velocity)
-        now = self._clock()
-        for axis in self._axes:
-            self._poll_by_sdo(axis, now)
+        self._poll(self._clock())
+        self._requested_after = self._axes[0].syncs
         self._send_outputs()
 
     def _write_setpoints(self, position: Triple, velocity: Triple) -> None:
@@ -447,14 +450,15 @@ class Cia402(Driver[Cia402Axis]):
         for axis in self._axes:
             self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
 
-    def _poll_by_sdo(self, axis: Cia402Axis, now: float) -> None:
-        """Request the values that no PDO contains by SDO, one request at a time, without waiting."""
-        if axis.sdo_asked is not None or self._is_being_configured(axis):
-            return
-        if axis.pdo_silent or ((axis.exchange.polled or axis.awaits_mode) and now >= axis.poll_due):
-            self._ask(axis, axis.request())
-            axis.pdo_silent = False
-            axis.poll_due = now + canopen_frames.POLL_PERIOD
+    def _poll(self, now: float) -> None:
+        """Request the values that no PDO contains by SDO, one request at a time for each drive, without waiting."""
+        for axis in self._axes:
+            if axis.sdo_asked is not None or self._is_being_configured(axis):
+                continue
+            if axis.pdo_silent or ((axis.exchange.polled or axis.awaits_mode) and now >= axis.poll_due):
+                self._ask(axis, axis.request())
+                axis.pdo_silent = False
+                axis.poll_due = now + canopen_frames.POLL_PERIOD
 
     def _command(self) -> None:
         """Send the controlwords that are due, one transition per drive at a time."""

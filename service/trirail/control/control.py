@@ -69,7 +69,7 @@ class SteadyState(NamedTuple):
     code: int
     """Result of trirail.control.cycle.command in the latest cycle."""
     until: float
-    """Cycle after which Python must decide. If it has passed, Python must decide after every cycle."""
+    """Cycle after which Python must decide. If it has passed, or is -inf, Python must decide after every cycle."""
     settles_by: int | None
     """Cycle in which the in-position time-out of the current goal elapses; None if no goal is settling."""
 
@@ -136,6 +136,8 @@ class Control:
         follows = self._follows
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
         if stopped_now or mode in (Mode.ENABLING, Mode.HOMING):
+            return None
+        if self.measured.feedback.fault is not None:  # Python reads and notes that a reset has cleared it
             return None
         if self.outputs.any:
             self.outputs.follow_mode(mode)

@@ -352,3 +352,4 @@ class Loop:
         self._heart.beat()
         self._planner.accept()
         self._reports.flush()
+        self._call_budget.note(0)  # calls that are no longer served are not measured either

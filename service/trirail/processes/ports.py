@@ -67,7 +67,7 @@ class GatewayLink:
                 return
             try:
                 self._in_hand.append(decode_request(memoryview(packet)[1:]))
-            except msgspec.DecodeError:
+            except (msgspec.DecodeError, UnicodeDecodeError):
                 self._port.hang_up()
 
     def requests(self) -> Iterator[Request]:
@@ -147,7 +147,7 @@ class PlannerLink:
                 continue
             try:
                 answer = decode_plan_answer(packet)
-            except msgspec.DecodeError as error:  # the supervisor restarts a planner that sends invalid packets
+            except (msgspec.DecodeError, UnicodeDecodeError) as error:  # the supervisor restarts a planner that sends invalid packets
                 self._port.hang_up()
                 self._awaited = None
                 yield PlannerLost(f"the planner has sent an invalid packet, {error}")
