@@ -6,10 +6,12 @@ Whole sessions are generated, and run twice over a bus by a clock of the test's:
 from __future__ import annotations
 
 import errno
+import math
 import random
 import re
 import struct
 import time
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
@@ -32,6 +34,7 @@ from trirail.wire import links
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.links import Port
 from trirail.wire.messages import Notice
+from trirail.wire.packed_trajectory import PackedTrajectory
 from trirail.wire.packets import (
     Announcement,
     CommandRequest,
@@ -45,6 +48,7 @@ from trirail.wire.packets import (
 )
 from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
+from trirail.wire.sizes import MAX_PART
 from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.bus.can_frame import BIT_RATE_SWITCH, CAN_FRAME, CANFD_FRAME, CAPTURED, FD_FORMAT
 from trirail_drivers.bus.frames import packed, unpacked
@@ -593,6 +597,35 @@ def test_that_a_fault_is_over_is_noted_in_the_same_cycle(protocol: str, tmp_path
     one = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 600)
     assert any("wrong length" in repr(each) for each in one.heard)
     assert one.loop.control.state.mode is Mode.HOLDING
+
+
+def test_two_users_lengthy_goals_are_planned_in_the_same_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each may interrupt the planning of the other, in whichever way the cycles in between are run."""
+
+    def ask(ticket: int, user: str) -> Happening:
+        rows = array("d")
+        for i in range(MAX_PART + 1):
+            rows.extend((0.05 * i, 3e-5 * i, 0.0, 0.0, *(math.nan,) * 6))
+        goal = PackedTrajectory(rows.tobytes())
+        return Happening(lambda session: session.ask(GoalRequest(ticket, user, user, goal, session.now_ns)))
+
+    def slowly(session: Session, deadline_ns: int) -> None:
+        """The planner takes 40 cycles for what it was asked last."""
+        cycle = session.loop.control.cycles
+        while (packet := session.planner.receive()) is not None:
+            asked[session] = cycle + 40, packet
+        if session in asked and cycle >= asked[session][0]:
+            session.planner.send(encode(session.motion.plan(decode_plan_request(asked.pop(session)[1]))))
+        sleep(session, deadline_ns)
+
+    asked, sleep = dict[Session, tuple[int, bytes]](), Session.sleep
+    monkeypatch.setattr(Session, "sleep", slowly)
+    happens = {
+        30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+        100: [ask(2, "ann")],
+        101: [ask(3, "bob")],
+    }
+    both_ways(CONFIG, tmp_path, lambda: happens, 400)
 
 
 @pytest.mark.parametrize("quiet", [True, False])

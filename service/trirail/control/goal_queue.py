@@ -81,6 +81,8 @@ class GoalQueue:
         expiring = min((goal.expires for number, goal in enumerate(self._ledger.goals) if number), default=math.inf)
         if self._planner.busy and self._planned is not None:
             request, sent, _ = self._planned
+            if self._is_passed(self._planned):
+                return cycle
             valid = request.goal.valid_for
             expiring = min(expiring, self._alive_until(self._planned))
             expiring = min(expiring, sent + valid / self._period if valid is not None else math.inf)

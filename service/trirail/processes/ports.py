@@ -147,7 +147,7 @@ class PlannerLink:
                 continue
             try:
                 answer = decode_plan_answer(packet)
-            except (msgspec.DecodeError, UnicodeDecodeError) as error:  # the supervisor restarts a planner that sends invalid packets
+            except (msgspec.DecodeError, UnicodeDecodeError) as error:  # the supervisor restarts such a planner
                 self._port.hang_up()
                 self._awaited = None
                 yield PlannerLost(f"the planner has sent an invalid packet, {error}")
