@@ -10,8 +10,8 @@ from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, QUI
 from drivers.test_foreign import MAKES, PERIOD, Rig
 from msgspec import structs
 from rigs import OFF, Closing, frame
-from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.codes import describe_error
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.timing import BusTiming

@@ -56,6 +56,13 @@ from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override
 from trirail_drivers.interface import DriveGroup
 
+NESTED = b"\x91" * 5000
+"""Deeper than a decoder goes."""
+UNREADABLE = (b"\xa4\xff\xfe\xfd\xfc", NESTED)
+"""What a packet may have instead of a string: bytes that are not UTF-8, and lists within lists."""
+COMMANDS = [bytes(message(CommandRequest(9, "ann", Command.STOP)))[1:].replace(b"\xa3ann", each) for each in UNREADABLE]
+COMMANDS.append(bytes(message(CommandRequest(9, "ann", Command.STOP)))[1:-1] + NESTED)
+
 
 class Shell:
     """A loop over the simulated drives, cycled by hand, with a gateway at its port."""
@@ -460,12 +467,15 @@ def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) 
 
 def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     shell.enabled()
-    shell.recorder.send(message(Announcement(Notice("service", "warning", "the disk is full"))))
-    shell.recorder.send(b"\x02nonsense")
-    shell.cycles(60)
-    full, unreadable = shell.events()[2:]
+    notice = message(Announcement(Notice("service", "warning", "the disk is full")))
+    unreadable = [notice.replace(b"\xb0the disk is full", each) for each in UNREADABLE]
+    for packet in (notice, b"\x02nonsense", *unreadable):
+        shell.recorder.send(packet)
+        shell.cycles(60)
+    full, *invalid = shell.events()[2:]
     assert (full.level, full.message) == ("warning", "the disk is full")
-    assert unreadable.message.startswith("the recorder has sent an invalid packet")
+    assert len(invalid) == 1 + len(unreadable)
+    assert all(event.message.startswith("the recorder has sent an invalid packet") for event in invalid)
     assert shell.loop.control.state.mode is Mode.HOLDING
 
 
@@ -610,7 +620,8 @@ def test_a_planner_that_is_not_there_costs_the_goal_and_the_next_one_is_taken(sh
     "junk",
     [
         *(b"", b"\x00", b"nonsense", message(Announcement(Notice("service", "info", "hello"))), b"\xff" * 1000),
-        encode(NotPlanned(1, 1, RefusalCode.NO_PLAN, "text")).replace(b"text", b"\xff\xfe\xfd\xfc"),
+        *(encode(NotPlanned(1, 1, RefusalCode.NO_PLAN, "text")).replace(b"\xa4text", each) for each in UNREADABLE),
+        b"\x81\xa1x" + NESTED,
     ],
 )
 def test_what_is_no_answer_ends_the_planner_and_not_the_robot(shell: Shell, junk: bytes) -> None:
@@ -664,7 +675,7 @@ def test_the_recorder_has_every_answer_with_the_cycle_in_which_it_was_taken(shel
     assert planned.cycle == goal.cycle + 1
 
 
-@pytest.mark.parametrize("words", [b"", b"{}", b"\x93\x01\xff", bytes(range(256))])
+@pytest.mark.parametrize("words", [b"", b"{}", b"\x93\x01\xff", bytes(range(256)), *COMMANDS])
 def test_a_gateway_that_says_what_cannot_be_read_is_let_go(shell: Shell, words: bytes) -> None:
     shell.enabled()
     shell.received(shell.recorder)

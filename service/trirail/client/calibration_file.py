@@ -13,7 +13,7 @@ from trirail_drivers.errors import FileError
 
 from trirail.alignment.camera_calibration import CameraCalibration, Marks
 from trirail.alignment.images import Pair
-from trirail.wire.decoding import decoded, prepare
+from trirail.wire.decoding import INVALID, decoded, prepare
 
 VERSION: Literal[1] = 1
 
@@ -79,6 +79,6 @@ def read(path: Path) -> CalibrationFile:
     text = files.text(path)
     try:
         return decoded(text, CalibrationFile)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+    except INVALID as error:
         problem = str(error).replace("`", "")
         raise FileError(f"{path}: {problem}; create it again with trirail align calibrate") from error

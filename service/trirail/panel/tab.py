@@ -19,7 +19,7 @@ from trirail.errors import RefusalCode
 from trirail.panel.feed import Feed, now
 from trirail.panel.messages import AnyPageMessage, CheckPath, CheckPose, JogHeld, JogReleased, SendCommand, StateDrawn
 from trirail.panel.tab_requests import MAX_STATE_AGE_MS, TabRequests, refusal
-from trirail.wire.decoding import decoded, prepare
+from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.goals import Goal
 
 
@@ -110,7 +110,7 @@ class Tab:
     def _on_message(self, text: str | bytes) -> None:
         try:
             message: AnyPageMessage = decoded(text, AnyPageMessage)
-        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        except INVALID as error:
             self._enqueue(
                 "refused", to="page", message=f"not a message of this page: {error}", code=RefusalCode.MALFORMED
             )

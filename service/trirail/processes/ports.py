@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-import msgspec
-
 from trirail.processes.heartbeats import Watch
+from trirail.wire.decoding import INVALID
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.links import Port
 from trirail.wire.packets import PlannerLost, Request, decode_request
@@ -67,7 +66,7 @@ class GatewayLink:
                 return
             try:
                 self._in_hand.append(decode_request(memoryview(packet)[1:]))
-            except (msgspec.DecodeError, UnicodeDecodeError):
+            except INVALID:
                 self._port.hang_up()
 
     def requests(self) -> Iterator[Request]:
@@ -147,7 +146,7 @@ class PlannerLink:
                 continue
             try:
                 answer = decode_plan_answer(packet)
-            except (msgspec.DecodeError, UnicodeDecodeError) as error:  # the supervisor restarts such a planner
+            except INVALID as error:  # the supervisor restarts such a planner
                 self._port.hang_up()
                 self._awaited = None
                 yield PlannerLost(f"the planner has sent an invalid packet, {error}")

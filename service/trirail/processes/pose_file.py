@@ -15,7 +15,7 @@ from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
 from trirail.errors import ServiceError
-from trirail.wire.decoding import decoded, prepare
+from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.goal_kind import Coordinate, Coordinates, PoseName
 
 NAME = "poses.json"
@@ -68,7 +68,7 @@ class PoseFile:
             return decoded(files.text(self.path), Taught) if self.path.exists() else {}
         except (FileError, OSError) as error:
             raise ServiceError(f"{error}; this file holds the taught poses") from error
-        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        except INVALID as error:
             problem = str(error).replace("`", "")
             raise ServiceError(
                 f"{self.path}: {problem}; repair the file, or move it away and teach the poses again"

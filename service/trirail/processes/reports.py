@@ -15,6 +15,7 @@ from trirail_drivers.interface import DriveGroup, UnreadyDrives
 from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes.clock import Tick
+from trirail.wire.decoding import INVALID
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.links import Port
 from trirail.wire.messages import Notice
@@ -230,7 +231,7 @@ class Reports:
             self._recorded, self._unrecorded = True, ""
         try:
             content = decode_recorder(memoryview(packet)[1:])
-        except msgspec.DecodeError as error:  # a faulty recorder must not stop the robot
+        except INVALID as error:  # a faulty recorder must not stop the robot
             words = f"the recorder has sent an invalid packet: {error}"
             text = coded(words, EventCode.RECORDER_UNREADABLE, error=str(error))
             self._control.ledger.notices.append(Notice("service", "warning", text.text, **text.fields))

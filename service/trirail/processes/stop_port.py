@@ -20,12 +20,10 @@ from collections.abc import Callable
 from enum import Enum, auto
 from typing import Final, TypeVar
 
-import msgspec
-
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.sockets import Reserve, descriptor_limit, listen, source
 from trirail.wire import tls
-from trirail.wire.decoding import decoded
+from trirail.wire.decoding import INVALID, decoded
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answer_with
 from trirail.wire.text import quoted
@@ -247,7 +245,7 @@ class StopPort:
         """
         try:
             request = decoded(line, StopRequest)
-        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        except INVALID as error:
             return ErrorReply(RefusalCode.MALFORMED, quoted(f"not a valid stop request: {error}"))
         self._enter(caller, _Stage.WAITING, user or str(request.key.split("/")[3:4]))
         answered: asyncio.Future[CommandReply | ErrorReply] = self._loop.create_future()

@@ -17,7 +17,7 @@ from trirail_drivers import files
 
 from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
 from trirail.telemetry.retention import BLACK_BOX, sidecar
-from trirail.wire.decoding import decoded, prepare
+from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.messages import Event, FaultDetail, Notice
 from trirail.wire.packets import Announcement, CheckRequest, CommandRequest, ControlInput, GoalRequest
 
@@ -106,7 +106,7 @@ def load(recording: Path) -> Contents | None:
     """Return the contents saved next to a recording; None if the sidecar is missing, damaged or of another version."""
     try:
         contents = decoded(sidecar(recording).read_bytes(), Contents)
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+    except (OSError, *INVALID):
         return None
     contents.name = recording.name  # the recording and its sidecar may have been renamed
     return contents

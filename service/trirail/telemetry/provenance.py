@@ -18,7 +18,7 @@ from trirail_drivers.interface import NAMES
 from trirail.config import Config, parse
 from trirail.errors import ConfigError
 from trirail.naming import Labels
-from trirail.wire.decoding import decoded, prepare
+from trirail.wire.decoding import INVALID, decoded, prepare
 
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
 """Entity paths of the text documents that store a recording's provenance."""
@@ -79,7 +79,7 @@ def recorded_by(documents: Mapping[str, str]) -> Software | None:
     """Return the software versions stored in a recording; None if they are missing or cannot be decoded."""
     try:
         return decoded(documents.get(SOFTWARE, ""), Software)
-    except msgspec.DecodeError:
+    except INVALID:
         return None
 
 

@@ -33,7 +33,7 @@ from trirail.telemetry.journal import EVENTS, JSON, REQUESTS, WORDS, Line
 from trirail.telemetry.provenance import SOFTWARE
 from trirail.telemetry.recorded_inputs import decode_input
 from trirail.telemetry.recording import Recording
-from trirail.wire.decoding import decoded, prepare
+from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE
@@ -287,7 +287,7 @@ def _texts(batch: pa.RecordBatch, component: str, path: Path, what: str) -> list
 def _decoded(row: str, decode: Callable[[str], T], path: Path, what: str) -> T:
     try:
         return decode(row)
-    except msgspec.DecodeError as error:
+    except INVALID as error:
         raise ServiceError(f"{path}: written by another version: its {what} cannot be read: {error}") from error
 
 

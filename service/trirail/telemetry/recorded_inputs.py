@@ -74,7 +74,7 @@ def encode_input(what: ControlInput) -> str:
 
 
 def decode_input(text: str) -> ControlInput:
-    """Decode a control input from the JSON of a recording. Raises msgspec.DecodeError if it is invalid."""
+    """Decode a control input from the JSON of a recording. Raises errors in decoding.INVALID if it is invalid."""
     line = decoded(text, _Line)
     entry = line.get("given")
     if isinstance(entry, dict) and entry.get("type") in _NOTICES:

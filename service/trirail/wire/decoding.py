@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import threading
 from collections import Counter
-from typing import Any, TypeVar, overload
+from typing import Any, Final, TypeVar, overload
 
 import msgspec
 
@@ -18,6 +18,13 @@ from trirail.wire.text import quoted
 
 T = TypeVar("T")
 Decoder = msgspec.json.Decoder[Any] | msgspec.msgpack.Decoder[Any]
+
+INVALID: Final = (ValueError, RecursionError)
+"""Errors with which decoders refuse invalid content.
+
+The first includes msgspec.DecodeError, and UnicodeDecodeError for strings that are not UTF-8; the second is raised for
+content that is nested too deeply.
+"""
 
 _MADE: dict[Any, tuple[msgspec.json.Decoder[Any], msgspec.msgpack.Decoder[Any]]] = {}
 _MAKING = threading.Lock()
