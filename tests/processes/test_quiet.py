@@ -37,6 +37,7 @@ from trirail.wire.messages import Notice
 from trirail.wire.packed_trajectory import PackedTrajectory
 from trirail.wire.packets import (
     Announcement,
+    CheckRequest,
     CommandRequest,
     EventReport,
     GoalRequest,
@@ -49,7 +50,7 @@ from trirail.wire.packets import (
 from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
 from trirail.wire.sizes import MAX_PART
-from trirail.wire.vocabulary import MODES, Command, Mode
+from trirail.wire.vocabulary import MODES, AcquireLease, Command, Mode, ReleaseLease
 from trirail_drivers.bus.can_frame import BIT_RATE_SWITCH, CAN_FRAME, CANFD_FRAME, CAPTURED, FD_FORMAT
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.cia402.drives import Cia402
@@ -315,6 +316,56 @@ def script(seed: int, protocol: str = "cia402") -> dict[int, list[Happening]]:  
     return happens
 
 
+def requests_of_two(seed: int) -> dict[int, list[Happening]]:
+    """What two users ask for at the same robot, much of it in vain: too fast, too late or with the other's lease."""
+    chance = random.Random(seed)
+    tickets = iter(range(1, 10_000))
+    happens: dict[int, list[Happening]] = {}
+
+    def ask(number: int, request: Callable[[int, Session], Request]) -> None:
+        ticket = next(tickets)
+        happens.setdefault(number, []).append(Happening(lambda session: session.ask(request(ticket, session))))
+
+    def order(number: int, user: str, name: Command, content: Any = None) -> None:
+        ask(number, lambda ticket, _: CommandRequest(ticket, user, name, content))
+
+    def send(number: int, user: str, name: str, goal: Goal, age_ns: int = 0) -> None:
+        ask(number, lambda ticket, session: GoalRequest(ticket, user, name, goal, session.now_ns - age_ns))
+
+    def place(**more: Any) -> PoseGoal:
+        return PoseGoal(chance.uniform(-0.05, 0.05), chance.uniform(-0.05, 0.05), 0.0, **more)
+
+    order(30, "ann", Command.ENABLE)
+    number = 60
+    while number < CYCLES - 60:
+        number += chance.choice((3, 11, 40, 120))
+        user, name = chance.choice(("ann", "bob")), f"g{number}"
+        match chance.choice(("goal", "queue", "late", "jog", "checks", "acquire", "release", "reset")):
+            case "goal":
+                send(number, user, name, place())
+            case "queue":
+                for i in range(4):
+                    send(number + 2 * i, user, f"{name}-{i}", place(blend=0.01, valid_for=chance.choice((None, 0.1))))
+            case "late":
+                send(number, user, name, place(valid_for=chance.choice((0.002, 0.004, 0.05))))
+            case "jog":
+                jog = VelocityGoal(0.03, 0.0, 0.0, timeout=0.2)
+                bad = chance.choice((structs.replace(jog, x=100.0), structs.replace(jog, valid_for=0.001)))
+                for i, each in enumerate((jog, bad, jog, jog)[: chance.choice((2, 4))]):
+                    send(number + 15 * i, user, name, each, age_ns=5_000_000)
+            case "checks":
+                for goal in [place(speed=0.3) for _ in range(chance.choice((1, 5)))]:
+                    ask(number, lambda ticket, _, user=user, goal=goal: CheckRequest(ticket, user, goal))  # type: ignore[misc]
+            case "acquire":
+                order(number, user, Command.ACQUIRE, AcquireLease(timeout=0.2, force=chance.choice((False, True))))
+            case "release":
+                order(number, user, Command.RELEASE, ReleaseLease())
+            case "reset":
+                order(number, user, Command.RESET)
+                order(number + 8, user, Command.ENABLE)
+    return happens
+
+
 def both_ways(
     config: Config,
     folder: Path,
@@ -376,6 +427,12 @@ def test_a_session_on_can_fd_sends_what_it_sends_on_classical_can(seed: int, tmp
         (identifier, data[:length]) for identifier, length, data in map(CAN_FRAME.unpack, classical.sent)
     ]
     assert 0 < fd.driver.traffic < classical.driver.traffic
+
+
+@pytest.mark.generated(0, 1, 2, 3)
+@pytest.mark.parametrize("protocol", CONFIGS)
+def test_what_two_users_ask_for_is_answered_alike(protocol: str, seed: int, tmp_path: Path) -> None:
+    both_ways(CONFIGS[protocol], tmp_path, lambda: requests_of_two(seed), CYCLES)
 
 
 @pytest.mark.generated(0, 1, 2, 3)
