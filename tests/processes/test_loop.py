@@ -54,7 +54,7 @@ from trirail.wire.plan_packets import NotPlanned, PreemptingMotion, decode_plan_
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override
-from trirail_drivers.interface import DriveGroup
+from trirail_drivers.interface import DriveGroup, MissingProtection
 
 NESTED = b"\x91" * 5000
 """Deeper than a decoder goes."""
@@ -737,7 +737,7 @@ def test_a_gateway_is_not_told_what_the_gateway_before_it_was_owed(shell: Shell,
     assert isinstance(after.answered["check"], GoalReply)
 
 
-def test_a_status_that_changes_while_a_new_gateway_starts_reaches_it(
+def test_what_changes_while_a_new_gateway_starts_reaches_it(
     shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The past events fill the socket of a gateway that does not read yet, as large as a usual kernel allows."""
@@ -753,10 +753,15 @@ def test_a_status_that_changes_while_a_new_gateway_starts_reaches_it(
     shell.gateway = links.connect(tmp_path / "gateway")
     shell.cycles(100)  # it imports its modules
     shell.loop.control.modes.trip(coded("the emergency stop is pressed", EventCode.OTHER), FaultCause.QUICK_STOP)
+    missing = (MissingProtection("A", "0x1016", "no heartbeat"),)
+    with monkeypatch.context() as patched:
+        patched.setattr(type(shell.rig.driver), "missing_protections", missing)
+        shell.loop._reports.report_protections()
     shell.cycles(300)
-    told = []
+    told: list[Answer] = []
     for _ in range(20):  # and then reads everything
-        told += [said for said in shell.said() if isinstance(said, Status)]
+        told += shell.said()
         shell.cycles(30)
     assert shell.mode() is Mode.FAULT
-    assert told[-1].fault == "the emergency stop is pressed"
+    assert [said.fault for said in told if isinstance(said, Status)][-1] == "the emergency stop is pressed"
+    assert [said.missing_protections for said in told if isinstance(said, Welcome)][-1] == missing

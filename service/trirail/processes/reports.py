@@ -73,8 +73,8 @@ class Reports:
         self._period = config.period
         self._welcome = Welcome(lacking, drives.bus_load, drives.missing_protections)
         self._status = Status(None, 1.0, None)
-        self._unsent_status = False
-        """True if the gateway had no space for the newest status, which is then sent with the next batch."""
+        self._unsent: dict[type, Status | Welcome] = {}
+        """Newest status and welcome for which the gateway had no space, to be sent with the next batch."""
         self._bus_load = 0.0
         self._traffic = drives.traffic
         self._bus_measured_at = self._progress_at = 0
@@ -179,8 +179,8 @@ class Reports:
         self._measure_bus_load()
         if self._control.measured.feedback.unready != self._unready:
             self._report_progress()
-        if self._unsent_status:
-            self._send_status()
+        for unsent in tuple(self._unsent.values()):
+            self._send_state(unsent)
         self.accept_peers()
         self._send_events()
 
@@ -198,7 +198,7 @@ class Reports:
         missing = self._drives.missing_protections
         if missing != self._welcome.missing_protections:
             self._welcome = msgspec.structs.replace(self._welcome, missing_protections=missing)
-            self._gateway.send(message(self._welcome))
+            self._send_state(self._welcome)
 
     def _report_progress(self) -> None:
         """Send the status with the progress of the drives' configuration, at most every PROGRESS_EVERY."""
@@ -275,12 +275,14 @@ class Reports:
         status = Status(*fields, self._unrecorded, tuple(map(quoted, control.measured.unready)))
         if status != self._status:
             self._status = status
-            self._send_status()
+            self._send_state(status)
             self._recorder.send(message(status))
 
-    def _send_status(self) -> None:
-        """Send the status to the gateway. It is sent again if there is no space, because a next one may never come."""
-        self._unsent_status = not self._gateway.send(message(self._status)) and self._gateway.connected
+    def _send_state(self, state: Status | Welcome) -> None:
+        """Send a state to the gateway. If there is no space, keep it, because a newer state may never follow."""
+        self._unsent.pop(type(state), None)
+        if not self._gateway.send(message(state)) and self._gateway.connected:
+            self._unsent[type(state)] = state
 
     def _send_answers(self) -> None:
         """Send at most ANSWERS_A_CYCLE answers. Answers wait for a slow gateway; if the gateway is lost, drop them."""
