@@ -19,6 +19,7 @@ from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.inspection import inspect
 from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.errors import BusError, DriveError
+from trirail_drivers.simulated.device import Nmt
 from trirail_drivers.simulated.dictionary import UNSUPPORTED_ACCESS
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
@@ -403,3 +404,71 @@ def test_inputs_have_a_pdo_of_their_own_where_the_statusword_has_none(closing: C
     rig.nodes[0].put(0x60FD, PART | 1)
     rig.feedback = rig.cycle(rig.feedback.position)
     assert rig.cycle(rig.feedback.position).inputs == (PART, 0, 0)
+
+
+# ---------------------------------------------------------------------- drives that miss outputs
+
+
+def switched_on(rig: Rig) -> Rig:
+    """With power, and an output that is on where it is not safe."""
+    ready(rig)
+    rig.enable()
+    rig.drives.set_outputs((VALVE, 0, 0))
+    rig.cycles(5)
+    assert rig.devices[0].pins.bits == VALVE
+    return rig
+
+
+@pytest.mark.parametrize("state", [Nmt.PRE_OPERATIONAL, Nmt.STOPPED])
+@pytest.mark.parametrize("mapped", [True, False])
+def test_a_drive_that_has_left_operational_gets_its_safe_outputs(rig: Rig, mapped: bool, state: Nmt) -> None:
+    """It receives no PDO, so they come by SDO as the commands to stop do, and do not wait for a reset."""
+    if not mapped:
+        unmappable(rig)
+    a = switched_on(rig).devices[0]
+    a._enter(state)
+    rig.found("silent", 5)
+    rig.drives.set_outputs((LAMP, 0, 0))  # the heartbeat that tells of the state is up to 0.1 s away
+    rig.cycles(800)
+    assert a.nmt is Nmt.PRE_OPERATIONAL
+    assert a.pins.bits == LAMP
+    rig.drives.reset()
+    rig.cycles(200)
+    rig.drives.set_outputs((VALVE | LAMP, 0, 0))
+    rig.cycles(5)
+    assert a.pins.bits == VALVE | LAMP
+
+
+@pytest.mark.parametrize("when", ["before the cut", "after the fault"])
+@pytest.mark.parametrize("mapped", [True, False])
+def test_a_drive_that_was_cut_off_for_some_cycles_gets_its_outputs(rig: Rig, mapped: bool, when: str) -> None:
+    """The other nodes acknowledge what it misses. It is back before its set-up would be checked again."""
+    if not mapped:
+        unmappable(rig)
+    a = switched_on(rig).devices[0]
+    a.silent = True
+    if when == "before the cut":  # the drive answers no SYNC any more, which is not known in this cycle
+        rig.drives.set_outputs((LAMP, 0, 0))
+    rig.found("silent", 5)
+    rig.drives.set_outputs((LAMP, 0, 0))
+    rig.cycles(20)
+    a.silent = False
+    rig.cycles(3 if mapped else 600)
+    assert a.pins.bits == LAMP
+    rig.bus.sent.clear()
+    rig.cycles(50)
+    assert outputs_sent(rig) == [[], [], []]
+    assert by_sdo(rig, 0) == []
+
+
+def test_outputs_by_sdo_go_on_after_an_answer_was_lost(rig: Rig) -> None:
+    unmappable(rig)
+    a = switched_on(rig).devices[0]
+    rig.bus.faults.add("A drop sdo-answer")
+    rig.drives.set_outputs((LAMP, 0, 0))
+    rig.cycle()
+    rig.bus.faults.clear()
+    for word in (VALVE, LAMP):
+        rig.drives.set_outputs((word, 0, 0))
+        rig.cycles(600)
+        assert a.pins.bits == word

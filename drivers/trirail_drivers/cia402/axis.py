@@ -84,8 +84,10 @@ class Cia402Axis(Axis):
         """Index of the object whose SDO answer is pending, little-endian."""
         self.unanswered = 0
         """Number of unanswered SDO requests."""
-        self.answered_by = -math.inf
-        """Time by which the drive must have answered the newest SDO request [s]."""
+        self.answered_by = self.unanswered_since = -math.inf
+        """Time by which the drive must have answered the newest SDO request, and time since when requests have been
+        unanswered without a break [s].
+        """
         self.poll_due = self._register_until = -math.inf
         """Time of the next statusword request, and time until which the error register may arrive [s]."""
         self.register_wanted = False
@@ -117,8 +119,17 @@ class Cia402Axis(Axis):
 
     def note_request(self, now: float) -> None:
         """Record an SDO request."""
+        if not self.unanswered:
+            self.unanswered_since = now
         self.unanswered += 1
         self.answered_by = now + ANSWER_TIME
+
+    def forget_lost_requests(self, now: float) -> bool:
+        """Whether SDO requests or their answers have been lost until time `now` [s]; if so, stop waiting for them."""
+        lost = self.unanswered > 0 and now >= self.unanswered_since + ANSWER_TIME
+        if lost:
+            self.unanswered = 0
+        return lost
 
     def rejoin(self, exchange: process_data.Exchange, units: Units, now: float, *, homed: bool) -> None:
         """Let the drive take part in the cycle again after a set-up in the background."""
@@ -352,6 +363,7 @@ class Cia402Axis(Axis):
         """Record that the drive no longer receives PDOs; its state is unknown until it answers by SDO."""
         self._operational = False
         self.left_operational = True
+        self.outputs_sent = NOTHING_SENT  # the drive may have missed the last ones
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
 
     @property

@@ -289,17 +289,23 @@ class Cia402(Driver[Cia402Axis]):
         self._recover()
 
     def _send_outputs(self) -> None:
-        """Send the digital outputs that have changed.
+        """Send the digital outputs that have changed, or that a drive may have missed.
 
-        Drives apply outputs from a PDO at the next SYNC, and outputs from an SDO when they receive it.
+        Drives apply outputs from a PDO at the next SYNC, and outputs from an SDO when they receive it. A drive that has
+        left NMT operational receives only the SDO.
         """
+        now = self._clock()
         for number, axis in enumerate(self._axes):
+            by_pdo = axis.maps_outputs and not axis.left_operational
+            silent = axis.missed >= self._drives.missed_positions
+            if silent if by_pdo else axis.forget_lost_requests(now):
+                axis.outputs_sent = NOTHING_SENT
             if not (outputs_pending(axis) and axis.configured):
                 continue
             wanted = axis.outputs
-            if axis.maps_outputs:
+            if by_pdo:
                 put_outputs(axis, self._tables.outputs.frames[number, DATA_AT:])
-                sent = self._wire.send(self._tables.outputs.frame(number))
+                sent = self._wire.send(self._tables.outputs.frame(number)) and not silent
             elif axis.unanswered or self._is_being_configured(axis):  # a server handles one request at a time (CiA 301)
                 continue
             else:
