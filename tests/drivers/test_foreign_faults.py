@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterator
 
 import can
@@ -12,6 +13,7 @@ from msgspec import structs
 from rigs import OFF, Closing, frame
 from trirail_drivers.cia402.codes import describe_error
 from trirail_drivers.cia402.drives import Cia402
+from trirail_drivers.config import Homing
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.timing import BusTiming
@@ -313,3 +315,29 @@ def test_a_drive_whose_statusword_is_polled_is_asked_also_without_sync_and_setpo
             break
     assert feedback.fault is not None
     assert feedback.fault.cause == "emcy", feedback.fault.message
+
+
+def test_a_homing_that_the_bus_broke_off_leaves_the_statusword_polled(closing: Closing) -> None:
+    """The request for the mode is refused, and no answer comes. Nothing else is requested while one is awaited."""
+    make, habits = WAYS["statusword polled"]
+    homing = Homing(method=19, speed_switch=0.05, speed_zero=0.01, acceleration=2.0)
+    rig = closing(Rig(make, habits(), homing=homing))
+    rig.ready()
+    rig.enable()
+    rig.drives.home()
+    send = rig.wires.send
+    vars(rig.wires).update(send=refused)
+    assert rig.found("bus", 10).message.startswith("CAN bus: cannot send: ")
+    vars(rig.wires).update(send=send)
+    feedback = rig.cycles(200)
+    assert PowerState.OPERATION_ENABLED not in feedback.state
+    rig.drives.reset()
+    assert rig.cycles(200).fault is None
+    rig.drives.enable()
+    assert rig.cycles(200).state == (PowerState.OPERATION_ENABLED,) * 3
+    assert [node.mode for node in rig.nodes] == [8, 8, 8]
+
+
+def refused(msg: can.Message, timeout: float | None = None) -> None:
+    """Send nothing, since the queue is full."""
+    raise can.CanOperationError("No buffer space available", errno.ENOBUFS)

@@ -97,7 +97,7 @@ class HomingSequence:
         self._end()
         for axis, _ in self._plan:
             axis.mode_bits = 0
-            axis.held = None
+            axis.held = axis.sdo_asked = None  # nothing else is requested while an answer is awaited
 
     @property
     def idle(self) -> bool:
