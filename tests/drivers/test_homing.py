@@ -253,6 +253,31 @@ def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pyte
     rig.until(lambda: rig.mode is Mode.HOLDING)
 
 
+def test_an_earlier_homing_error_is_not_taken_for_one_of_this_homing(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive, homing = rig.drives[0], rig.drives[0].homing
+    forget = homing.forget
+
+    def keep() -> None:  # a drive that tells of its last homing until the next one is started
+        failed = homing.failed
+        forget()
+        homing.failed = failed and drive.objects[0x6040, 0].value & canopen_frames.HOMING_START == 0
+
+    monkeypatch.setattr(homing, "forget", keep)
+    rig.enable()
+    begin(rig, 100)
+    homing.failed = True
+    homing.interrupt()
+    rig.until(lambda: rig.mode is Mode.FAULT, 50)
+    rig.cycles(300)
+    assert isinstance(rig.command("reset"), CommandDone)
+    rig.enable()
+    assert homing.failed
+    is_homed(rig)
+    settled(rig)
+
+
 # ---------------------------------------------------------------------- what stops it
 
 

@@ -219,9 +219,9 @@ class HomingSequence:
 def _attained(axis: Cia402Axis) -> bool:
     """Whether the drive has found home.
 
-    Bit 12 may still be set from an earlier homing, so it must have been clear since this homing began.
+    Bits 12 and 13 may still be set from an earlier homing, so they must have been clear since this homing began.
     """
-    if axis.statusword & _ERROR:
+    if axis.statusword & axis.seen_clear & _ERROR:
         raise HomingFailedError(f"the drive reports a homing error (statusword {axis.statusword:04X})")
     both = _HOMING_ATTAINED | _TARGET_REACHED
     return axis.statusword & both == both and bool(axis.seen_clear & _HOMING_ATTAINED)
