@@ -477,6 +477,25 @@ def test_no_other_master_may_be_on_the_bus(
     rig.wires.shutdown()
 
 
+class Echoing(Bus):
+    """A bus that returns this end's frames with a mark, as gs_usb does."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self._arrived.append(frame(msg.arbitration_id, bytes(msg.data), is_rx=False))
+        super().send(msg, timeout)
+
+
+def test_its_own_requests_are_not_those_of_another_master() -> None:
+    with Line(SERVO) as line:
+        line.bus.__class__ = Echoing
+        saved = line.save()
+        assert line.restore(saved).ok
+        assert isinstance(line.bus, Echoing)
+        line.bus.inject(0x601, bytes(8))
+        with pytest.raises(DriveError, match="another master is on the bus and accesses drives by SDO"):
+            line.save()
+
+
 def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
     rig = Foreign(tmp_path)
     saved = rig.save()

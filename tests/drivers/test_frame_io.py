@@ -19,6 +19,7 @@ from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED, ERROR, EXTENDED, 
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames
 from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.own_frames import OwnFrames
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.timing import BusTiming
 
@@ -255,7 +256,7 @@ class EchoingBus(can.BusABC):
 def test_what_this_end_has_sent_has_not_arrived(marked: bool) -> None:
     """But what another has sent has, though it be the same frame; one of ours that is lost hides none of theirs."""
     with EchoingBus(marked=marked) as bus:
-        frames = PythonCanFrames(bus, receives_own_frames=not marked)
+        frames = PythonCanFrames(bus, OwnFrames(bus, unmarked=not marked))
         bus.arrived.append(frame(0x181, b"\1"))
         for identifier in (0x201, 0x080, 0x202):
             frames.send(Frame(identifier))

@@ -20,7 +20,6 @@ from typing import Final, Protocol
 
 import can
 from can.interfaces.socketcan import SocketcanBus
-from can.interfaces.udp_multicast import UdpMulticastBus
 from can.typechecking import CanFilter
 
 from trirail_drivers.bus.can_frame import (
@@ -35,6 +34,7 @@ from trirail_drivers.bus.can_frame import (
 )
 from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.frames import Frame, can_id, fd_packed, is_fd
+from trirail_drivers.bus.own_frames import OwnFrames
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.bus.unixbus import UnixBus
 
@@ -76,7 +76,7 @@ def frame_io(bus: can.BusABC) -> FrameIO:
     if isinstance(inner, SocketcanBus) and inner.channel and inner.protocol in formats:
         # A capture needs every frame; without one, the kernel filters out frames that have no listener.
         return SocketFrames(inner.socket, capture, interface=inner, filtered=not capture, fd=is_fd(inner))
-    return PythonCanFrames(bus, receives_own_frames=isinstance(inner, UdpMulticastBus))
+    return PythonCanFrames(bus, OwnFrames(inner))
 
 
 class SocketFrames:
@@ -188,16 +188,12 @@ class PythonCanFrames:
     Therefore the bus is read until its file descriptor has no more data. Without a descriptor, it is read once more for
     each sent frame that may have been acknowledged.
 
-    Some interfaces also return the frames that this end has sent: gs_usb marks them, a multicast group does not. These
-    frames are dropped.
+    Some interfaces also return the frames that this end has sent. These frames are dropped.
     """
 
-    def __init__(self, bus: can.BusABC, *, receives_own_frames: bool = False) -> None:
-        """`receives_own_frames` is True if the bus returns this end's frames, in order and without a mark."""
+    def __init__(self, bus: can.BusABC, own: OwnFrames | None = None) -> None:
         self._bus = bus
-        self._own: deque[tuple[int, bytes]] | None = deque(maxlen=MAX_EMPTY_READS) if receives_own_frames else None
-        # SocketCAN marks every frame from this machine, including those of other programs.
-        self._marks_own = not isinstance(bus, SocketcanBus)
+        self._own = OwnFrames(bus) if own is None else own
         self._poll: select.poll | None = None
         self._unanswered = 0
         """Number of sent frames for which the interface may still return None as the acknowledgement."""
@@ -211,8 +207,7 @@ class PythonCanFrames:
         message = frame.message()
         self._bus.send(message, timeout=0)
         self._unanswered = min(self._unanswered + 1, MAX_EMPTY_READS)
-        if self._own is not None:
-            self._own.append((can_id(message), bytes(message.data)))
+        self._own.note(message)
 
     def receive(self, timeout: float = 0.0) -> Received | None:
         """Return the next frame that has arrived or arrives within `timeout` [s]; otherwise None."""
@@ -221,24 +216,10 @@ class PythonCanFrames:
             if message is None:
                 if not self._may_have_more():
                     break
-            elif not self._is_own(message):
+            elif not self._own.include(message):
                 return can_id(message), message.data
             timeout = 0.0
         return None
-
-    def _is_own(self, message: can.Message) -> bool:
-        """Whether this end has sent the frame.
-
-        Older frames of this end that have not come back by now count as lost.
-        """
-        if self._own is None:
-            return self._marks_own and not message.is_rx
-        sent = can_id(message), bytes(message.data)
-        if sent not in self._own:
-            return False
-        while self._own.popleft() != sent:
-            pass
-        return True
 
     def set_identifiers(self, identifiers: Collection[int]) -> None:
         """Do nothing, since python-can's interfaces filter frames differently."""

@@ -10,6 +10,7 @@ from typing import Final
 
 import can
 
+from trirail_drivers.bus.own_frames import OwnFrames
 from trirail_drivers.bus.wire import Handler, Wire
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import Cia402Axis
@@ -84,6 +85,7 @@ class ExclusiveBus(can.BusABC):
 
     def __init__(self, bus: can.BusABC, nodes: Sequence[int], master_node: int) -> None:
         self.inner = bus
+        self._own = OwnFrames(bus)
         self.channel_info = bus.channel_info
         bases = {
             canopen_frames.SDO_REQUEST: "accesses drives by SDO",
@@ -99,11 +101,12 @@ class ExclusiveBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame."""
         self.inner.send(msg, timeout)
+        self._own.note(msg)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Receive a frame. Raises DriveError if another master sent it."""
         frame = self.inner.recv(timeout)
-        if frame is None or frame.is_error_frame or frame.is_extended_id:
+        if frame is None or frame.is_error_frame or frame.is_extended_id or self._own.include(frame):
             return frame
         text = self._masters.get(frame.arbitration_id, "")
         if frame.is_remote_frame and frame.arbitration_id in self._guarded:
