@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import can
 import canopen
 import msgspec
 import pytest
@@ -21,6 +23,7 @@ from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import ConfigurationRefused, DriveError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import SimulatedDrive
+from trirail_drivers.simulated.device import Nmt
 from trirail_drivers.simulated.dictionary import ObjectEntry
 from trirail_drivers.timing import BusTiming
 
@@ -542,3 +545,31 @@ class TestClose:
         rig = Rig()
         rig.drives.close()
         assert rig.bus.shutdowns == 1
+
+
+@pytest.mark.parametrize("refused", [True, False])
+def test_a_node_that_missed_its_start_is_started_again(ready: Rig, refused: bool) -> None:
+    """The frame waits while the queue is full. If the node itself has missed it, the next reset sends it again."""
+    ready.cycles(5)
+    a = ready.devices[0]
+    a._enter(Nmt.PRE_OPERATIONAL)
+    ready.cycles(200)
+    send = ready.bus.send
+
+    def lose(message: can.Message, timeout: float | None = None) -> None:
+        if message.arbitration_id != canopen_frames.NMT:
+            send(message, timeout)
+        elif refused:
+            raise can.CanOperationError("No buffer space available", errno.ENOBUFS)
+
+    vars(ready.bus).update(send=lose)
+    ready.drives.reset()
+    ready.cycle()
+    vars(ready.bus).update(send=send)
+    if not refused:
+        ready.cycles(1000)
+        assert a.nmt is Nmt.PRE_OPERATIONAL
+        ready.bus.late = 0  # from now on, an answer is read one cycle later
+        ready.drives.reset()
+    assert ready.cycles(300).fault is None
+    assert a.nmt is Nmt.OPERATIONAL

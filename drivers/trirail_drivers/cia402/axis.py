@@ -367,6 +367,11 @@ class Cia402Axis(Axis):
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
 
     @property
+    def has_missed_start(self) -> bool:
+        """Whether the drive answers no SYNC and has not been seen in NMT operational since it was started last."""
+        return self.missed > 0 and not self._operational
+
+    @property
     def may_miss_pdos(self) -> bool:
         """Whether the drive may miss PDOs, so that controlwords must also be sent by SDO."""
         return self.left_operational or self.missed > 0

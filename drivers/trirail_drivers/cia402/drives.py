@@ -427,6 +427,8 @@ class Cia402(Driver[Cia402Axis]):
         for axis in self._axes:
             if not axis.configured:
                 continue
+            if axis.has_missed_start:
+                axis.leave_operational()
             axis.start_wanted |= axis.left_operational
             axis.clear_faults(now)
         if self._leaves_room(len(self._axes) + sum(axis.start_wanted + axis.register_wanted for axis in self._axes)):
@@ -438,8 +440,7 @@ class Cia402(Driver[Cia402Axis]):
         """Start the nodes that a reset returns to NMT operational. Only then do they receive controlwords by PDO."""
         for axis in self._axes:
             if axis.start_wanted:  # the set-up is still valid: only a restarted drive needs a new one
-                axis.start_wanted = False
-                self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
+                axis.start_wanted = not self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
                 axis.outputs_sent = NOTHING_SENT  # the drive may have missed outputs, or changed them by itself
 
     def _ask_for_registers(self) -> None:
