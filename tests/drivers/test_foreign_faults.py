@@ -317,6 +317,33 @@ def test_a_drive_whose_statusword_is_polled_is_asked_also_without_sync_and_setpo
     assert feedback.fault.cause == "emcy", feedback.fault.message
 
 
+@pytest.mark.parametrize("command", [0x42, 0x43])
+def test_a_drive_that_pads_its_answers_is_heard_in_the_cycle_too(closing: Closing, command: int) -> None:
+    """As in the set-up: four bytes for each value, with their number (43h) or without it (42h)."""
+    make, habits = WAYS["statusword polled"]
+    given = habits()
+    given.tells_error_reset = False
+    rig = closing(Rig(make, given))
+    for node in rig.nodes:
+
+        def padded(data: bytearray, answer: Callable[[bytes], None] = node.local.sdo.send_response) -> None:
+            if data[0] >> 5 == 2 and data[0] & 0x02:
+                data = bytearray([command, *data[1:]])
+            answer(data)
+
+        vars(node.local.sdo).update(send_response=padded)
+    rig.ready()
+    assert rig.drives._axes[0].exchange.polled
+    assert rig.cycles(200).fault is None
+    rig.enable()
+    rig.go(0.05, 60)
+    rig.nodes[0].emergency(0x4210, 0x09)
+    rig.cycles(200)
+    rig.drives.reset()
+    assert rig.cycles(20).fault is None  # its error register tells that the error is over
+    rig.enable()
+
+
 def test_a_homing_that_the_bus_broke_off_leaves_the_statusword_polled(closing: Closing) -> None:
     """The request for the mode is refused, and no answer comes. Nothing else is requested while one is awaited."""
     make, habits = WAYS["statusword polled"]

@@ -229,14 +229,16 @@ class Cia402Axis(Axis):
         self.unanswered = max(0, self.unanswered - 1)
         if data[1:3] == self.sdo_asked:
             self.sdo_answer, self.sdo_asked = bytes(data), None
-        if data[:4] == canopen_frames.MODE_DISPLAY_UPLOADED and self.awaits_mode:
+        if canopen_frames.is_upload(data, canopen_frames.MODE_DISPLAY_UPLOADED) and self.awaits_mode:
             self._update_mode(data[4])
-        elif data[:4] == canopen_frames.STATUSWORD_UPLOADED:
+        elif canopen_frames.is_upload(data, canopen_frames.STATUSWORD_UPLOADED):
             self._on_statusword(data[4:6], now)
         elif data[:4] == canopen_frames.OUTPUTS_REFUSED:
             code = int.from_bytes(data[4:8], "little")
             self.note_fault("state", 0, f"refuses its digital outputs, object 60FE:01 (SDO abort {code:08X})")
-        elif data[:4] == canopen_frames.ERROR_REGISTER_UPLOADED and now < self._register_until:
+        elif (
+            canopen_frames.is_upload(data, canopen_frames.ERROR_REGISTER_UPLOADED) and now < self._register_until
+        ):
             self._register_until = -math.inf
             if data[4] == 0:
                 self.error_code = 0  # CiA 301, 1001h: no error is present

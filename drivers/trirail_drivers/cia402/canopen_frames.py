@@ -60,6 +60,8 @@ MODE_DISPLAY_UPLOADED: Final = b"\x4f\x61\x60\x00"
 """First bytes of the SDO answer with the mode display; the mode's byte follows."""
 STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"
 """First bytes of the SDO answer with the statusword; its two bytes follow."""
+_UPLOAD_BITS: Final = 0xE2
+"""Bits of the first byte of an SDO answer that contain the command specifier, and whether the upload is expedited."""
 
 NMT_START: Final = 0x01
 NMT_PRE_OPERATIONAL: Final = 0x80
@@ -124,6 +126,14 @@ TargetState = Literal[PowerState.SWITCH_ON_DISABLED, PowerState.OPERATION_ENABLE
 def nmt(command: int, node: int) -> Frame:
     """Return an NMT command to one node."""
     return Frame(NMT, NMT_COMMAND.pack(command, node))
+
+
+def is_upload(data: bytes | bytearray, answer: bytes) -> bool:
+    """Whether an SDO answer contains the value of the same object as `answer`, the first bytes of an expedited upload.
+
+    The size may differ or be missing, since some drives pad each value to four bytes.
+    """
+    return data[0] & _UPLOAD_BITS == answer[0] & _UPLOAD_BITS and data[1:4] == answer[1:4]
 
 
 def power_state(statusword: int) -> PowerState | None:
