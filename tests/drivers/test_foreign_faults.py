@@ -365,6 +365,39 @@ def test_a_homing_that_the_bus_broke_off_leaves_the_statusword_polled(closing: C
     assert [node.mode for node in rig.nodes] == [8, 8, 8]
 
 
+@pytest.mark.parametrize("phase", range(0, 20, 2))
+def test_homing_waits_for_the_answer_to_a_poll(closing: Closing, phase: int) -> None:
+    """A server handles one request at a time (CiA 301); these drives drop the next one until they have answered."""
+    make, habits = WAYS["statusword polled"]
+    homing = Homing(method=19, speed_switch=0.05, speed_zero=0.01, acceleration=2.0)
+    rig = closing(Rig(make, habits(), homing=homing))
+    rig.ready()
+    rig.enable()
+    a = rig.nodes[0]
+    answer, take, pump = a.local.sdo.send_response, a.local.sdo.on_request, a.pump
+    answers: list[tuple[float, bytes]] = []
+
+    def on_request(identifier: int, data: bytearray, timestamp: float) -> None:
+        if not answers:
+            take(identifier, data, timestamp)
+
+    def pumped(wait: float = 0.0) -> None:
+        if answers and rig.clock.now >= answers[0][0]:
+            answer(answers.pop(0)[1])
+        pump(wait)
+
+    vars(a.local.sdo).update(
+        send_response=lambda data: answers.append((rig.clock.now + 0.005, bytes(data))), on_request=on_request
+    )
+    vars(a).update(pump=pumped)
+    rig.cycles(20 + phase // 2, rig.target)
+    rig.drives._axes[0].unanswered += phase == 0  # an answer was lost
+    rig.drives.home()
+    feedback = rig.cycles(300, rig.target)
+    assert feedback.fault is None
+    assert a.mode == 6
+
+
 def refused(msg: can.Message, timeout: float | None = None) -> None:
     """Send nothing, since the queue is full."""
     raise can.CanOperationError("No buffer space available", errno.ENOBUFS)

@@ -194,9 +194,15 @@ class HomingSequence:
                 raise HomingFailedError(f"object 6061:00 (Modes of operation display): expected {mode}, found {shown}")
 
     def _sdo(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
-        """Perform one SDO transfer over several cycles, without blocking; return the answer."""
+        """Perform one SDO transfer over several cycles, without blocking; return the answer.
+
+        An SDO server handles one request at a time (CiA 301), so an earlier request of the cycle is answered first.
+        """
+        while axis.unanswered and not axis.forget_lost_requests(self._now):
+            yield
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
-        self._send(Frame(canopen_frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
+        if self._send(Frame(canopen_frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value])))):
+            axis.note_request(self._now)
         deadline = self._now + self._sdo_timeout
         while (answer := axis.sdo_answer) is None:
             if self._now >= deadline:
