@@ -253,9 +253,7 @@ def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pyte
     rig.until(lambda: rig.mode is Mode.HOLDING)
 
 
-def test_an_earlier_homing_error_is_not_taken_for_one_of_this_homing(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_earlier_homing_error_is_not_taken_for_one_of_this_homing(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     drive, homing = rig.drives[0], rig.drives[0].homing
     forget = homing.forget
 

@@ -236,9 +236,7 @@ class Cia402Axis(Axis):
         elif data[:4] == canopen_frames.OUTPUTS_REFUSED:
             code = int.from_bytes(data[4:8], "little")
             self.note_fault("state", 0, f"refuses its digital outputs, object 60FE:01 (SDO abort {code:08X})")
-        elif (
-            canopen_frames.is_upload(data, canopen_frames.ERROR_REGISTER_UPLOADED) and now < self._register_until
-        ):
+        elif canopen_frames.is_upload(data, canopen_frames.ERROR_REGISTER_UPLOADED) and now < self._register_until:
             self._register_until = -math.inf
             if data[4] == 0:
                 self.error_code = 0  # CiA 301, 1001h: no error is present
