@@ -329,7 +329,7 @@ def test_a_drive_that_pads_its_answers_is_heard_in_the_cycle_too(closing: Closin
         def padded(data: bytearray, answer: Callable[[bytes], None] = node.local.sdo.send_response) -> None:
             if data[0] >> 5 == 2 and data[0] & 0x02:
                 data = bytearray([command, *data[1:]])
-            answer(data)
+            answer(bytes(data))
 
         vars(node.local.sdo).update(send_response=padded)
     rig.ready()
@@ -374,7 +374,9 @@ def test_homing_waits_for_the_answer_to_a_poll(closing: Closing, phase: int) -> 
     rig.ready()
     rig.enable()
     a = rig.nodes[0]
-    answer, take, pump = a.local.sdo.send_response, a.local.sdo.on_request, a.pump
+    answer: Callable[[bytes], None] = a.local.sdo.send_response
+    take: Callable[[int, bytearray, float], None] = a.local.sdo.on_request
+    pump: Callable[[float], None] = a.pump
     answers: list[tuple[float, bytes]] = []
 
     def on_request(identifier: int, data: bytearray, timestamp: float) -> None:
