@@ -120,7 +120,7 @@ RULES = [
     Rule(
         "an edge ends its goal, also a paused one",
         {E.INPUT_EDGE},
-        {MOVING: Step(RELEASING, Action.BRAKE), PAUSING: Step(RELEASING), PAUSED: Step(HOLDING)},
+        {MOVING: Step(RELEASING, Action.BRAKE), PAUSING: Step(RELEASING, Action.BRAKE), PAUSED: Step(HOLDING)},
     ),
     Rule(
         "homing begins where the robot holds",

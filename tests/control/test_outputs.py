@@ -15,7 +15,7 @@ from trirail.config import SIM, Config, Input, Output, load
 from trirail.control.outputs import LOG_LENGTH, SWITCHED
 from trirail.errors import RefusalCode
 from trirail.wire.event_codes import EventCode
-from trirail.wire.goals import PoseGoal
+from trirail.wire.goals import MoveGoal, PoseGoal
 from trirail.wire.marks import Mark, StopAt, Switch
 from trirail.wire.messages import GoalReply
 from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, Refused, Request
@@ -287,6 +287,20 @@ def test_pulses_last_their_width_and_are_closed_by_a_stop(rig: Rig) -> None:
     assert np.all(widths == round(0.01 / rig.config.period))
 
 
+@pytest.mark.parametrize("blend", [None, 0.01])
+def test_a_pulse_may_end_long_after_its_goal_is_done(rig: Rig, blend: float | None) -> None:
+    rig.send("g1", PoseGoal(0.02, 0.0, 0.0, blend=blend, marks=(Mark("valve", after_start=0.005, pulse_width=2.0),)))
+    if blend is not None:
+        rig.send("g2", PoseGoal(0.02, 0.02, 0.0))
+    rig.until(rig.holds)
+    assert rig.value("valve")
+    rig.cycles(2500)
+    assert rig.control.fault is None
+    (on, off) = rig.changes("valve")
+    assert (on[1], off[1], off[0] - on[0]) == (True, False, round(2.0 / rig.config.period))
+    assert [(row.goal, row.value) for row in rig.switches] == [("g1", True), ("g1", False)]
+
+
 @pytest.mark.parametrize("how", ["stop", "quick_stop", "disable"])
 def test_a_stretch_is_closed_where_its_goal_is_stopped(rig: Rig, how: str) -> None:
     rig.send(
@@ -400,6 +414,31 @@ def test_an_edge_ends_a_paused_goal(rig: Rig, paused_for: int) -> None:
     assert isinstance(rig.command("resume"), Refused)
     rig.cycles(100)
     assert np.array_equal(before, rig.poses[-1])
+
+
+def test_an_edge_while_a_queue_is_being_paused_ends_the_goal_before_the_robot_passes_on(rig: Rig) -> None:
+    rig.post("g1", PoseGoal(0.1, 0.0, 0.0, blend=0.03, stop_at=StopAt("part")))
+    rig.post("g2", PoseGoal(0.1, 0.05, 0.0))
+    rig.until(lambda: rig.control.commanded.pose[0] > 0.055)  # it brakes until beyond the place of the blend
+    rig.order("pause")
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.cycle()
+    rig.until(lambda: rig.mode is not Mode.STOPPING, 5000)
+    assert rig.control.fault is None
+    assert sorted(rig.outcomes()) == [("g1", "done"), ("g2", "stopped")]
+
+
+def test_a_move_sent_while_a_goal_ends_at_an_edge_does_not_count_from_where_that_goal_would_have_ended(
+    rig: Rig,
+) -> None:
+    rig.send("g1", PoseGoal(0.1, 0.0, 0.0, speed=0.5, stop_at=StopAt("part")))
+    rig.cycles(250)
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.cycle()
+    touched = rig.poses[-1][0]
+    rig.send("g2", MoveGoal(-0.005, 0.0, 0.0))
+    rig.until(rig.holds, 20_000)
+    assert touched - 0.005 <= rig.poses[-1][0] < touched
 
 
 def test_a_goal_sent_while_one_ends_at_an_edge_is_done_for_its_own_reason(rig: Rig) -> None:

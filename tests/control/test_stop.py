@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from control_rig import CONFIG, ControlRig, carried
@@ -10,7 +12,7 @@ from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
 from trirail.wire.event_codes import EventCode, coded
-from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
+from trirail.wire.goals import Goal, MoveGoal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, GoalRequest, Refused
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override, Stop
 
@@ -160,6 +162,28 @@ def test_stop_of_one_of_several_goals_that_wait_for_a_plan_is_of_that_one_alone(
     assert slow.control.commanded.pose == pytest.approx((last, 0.0, 0.0))
 
 
+@pytest.mark.parametrize("next_goal", [PoseGoal(0.0, 0.0, 0.0), MoveGoal(0.02, 0.0, 0.0)])
+def test_a_goal_that_is_planned_behind_one_that_is_cancelled_follows_the_one_before(
+    rig: ControlRig, next_goal: Goal
+) -> None:
+    """Within the blend of that one, and relative to its end."""
+    rig.enable()
+    rig.planner.delay = 6
+    rig.send("g1", PoseGoal(0.1, 0.0, 0.0, blend=0.0))
+    rig.send("g2", PoseGoal(0.1, 0.08, 0.0, blend=0.05))
+    rig.post("g3", next_goal)
+    rig.cycles(2)
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, Stop("g2")))
+    places = []
+    while not rig.holds():
+        rig.cycle()
+        places.append(rig.control.commanded.pose)
+    assert rig.outcomes() == [("g2", "stopped"), ("g1", "done"), ("g3", "done")]
+    assert min(math.dist(place, (0.1, 0.0, 0.0)) for place in places) < 1e-6
+    end = (0.12, 0.0, 0.0) if isinstance(next_goal, MoveGoal) else (0.0, 0.0, 0.0)
+    assert places[-1] == pytest.approx(end, abs=1e-9)
+
+
 def test_a_goal_that_has_ended_cannot_be_stopped(rig: ControlRig) -> None:
     rig.enable()
     rig.goal("g1", 0.01, 0.0, 0.0)
@@ -187,6 +211,20 @@ def test_what_was_sent_before_a_pause_does_not_begin(slow: ControlRig) -> None:
     assert [outcome for outcome in slow.outcomes() if outcome[0] != "running"] == [("g1", "stopped"), ("g2", "stopped")]
     tickets = [answer.ticket for answer in slow.answers if isinstance(answer, Refused)]
     assert len(tickets) == len(set(tickets)) == 2  # each is answered once
+
+
+def test_a_goal_sent_twice_and_then_paused_goes_on_when_it_is_resumed_and_ends_once(rig: ControlRig) -> None:
+    rig.enable()
+    rig.planner.delay = 20
+    rig.goal("g1", 0.1, 0.0, 0.0)
+    rig.post("g2", PoseGoal(0.0, 0.03, 0.0))  # while it is planned, the next one waits
+    rig.post("g1", PoseGoal(0.1, 0.0, 0.0))
+    rig.command("pause")
+    assert rig.outcomes() == [("g2", "stopped")]
+    assert rig.control.state.paused
+    rig.command("resume")
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g2", "stopped"), ("g1", "done")]
 
 
 @pytest.mark.parametrize("wait", [0, 3, 10, 30])

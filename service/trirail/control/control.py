@@ -501,9 +501,12 @@ class Control:
 
     @property
     def _end_pose(self) -> Sequence[float]:
-        """Pose at the end of all current goals; the commanded pose if there is no goal, or for a jog or track."""
+        """Pose at the end of all current goals; the commanded pose if there is none, or if it does not end there.
+
+        A jog or track has no such end, and a goal that an input has stopped does not reach it.
+        """
         last, goal = self.schedule.last, self.ledger.goal
-        if last is None or goal is None or goal.kind.renewed:
+        if last is None or goal is None or goal.kind.renewed or self.state.released:
             return self.commanded.pose
         return last.end(self.commanded.pose)
 

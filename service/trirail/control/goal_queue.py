@@ -291,3 +291,6 @@ class GoalQueue:
         self._ledger.end(outcome, reason, but=number)
         self._schedule.drop(number - 1)
         self._planner.update_rate()
+        if self._planner.busy and self._planned is not None:  # it was to follow a goal that is dropped: plan it anew
+            self._planner.cancel()
+            self._waiting.appendleft(self._planned)

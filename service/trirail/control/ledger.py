@@ -218,7 +218,7 @@ class Ledger:
         self.answers.append(
             Refused(request.ticket, RefusalCode(outcome), f"goal {request.id} {outcome} before it began: {reason}")
         )
-        if not self.renewed_by(request):
+        if all(goal.id != request.id for goal in self.goals):  # otherwise the id is that of an active goal
             refusal = RefusedError(RefusalCode(outcome), reason)
             ended = coded(reason, EventCode.REFUSED)
             self._end_goal(request.id, request.user, type(request.goal), outcome, ended, refusal=refusal)

@@ -191,7 +191,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.GOAL: Step(MOVING, Action.START),
         ModeEvent.STOP: Step(STOPPING),
         ModeEvent.RESUME: Step(MOVING, Action.RESUME),
-        ModeEvent.INPUT_EDGE: Step(RELEASING),
+        ModeEvent.INPUT_EDGE: Step(RELEASING, Action.BRAKE),
         ModeEvent.HOME: _PAUSED,
         ModeEvent.STANDSTILL: Step(PAUSED),
         ModeEvent.ARRIVED: Step(HOLDING),

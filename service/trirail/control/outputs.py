@@ -401,7 +401,8 @@ class Outputs:
             )
             for row in rows
         ]
-        for goal in self._over:
+        active = set(self.state["goal"].tolist())  # the pulses of a goal that is done are still to end
+        for goal in [goal for goal in self._over if self._goals[goal] not in active]:
             del self._goals[goal]
-        self._over.clear()
+            self._over.remove(goal)
         return [tuple(switches[k : k + TABLE_LENGTH]) for k in range(0, len(switches), TABLE_LENGTH)]
