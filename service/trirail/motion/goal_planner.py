@@ -234,9 +234,14 @@ class GoalPlanner:
         """Return whether a path that is appended to a run stays within the limits under the run's law."""
         longer = run.copy()
         longer.append(s, path)
-        law, first = longer.law, longer.arrival_at(s)
-        last = longer.arrival_at(longer.path.duration)
+        first, last = longer.arrival_at(s), longer.arrival_at(longer.path.duration)
+        sampled = [(longer.law, first, min(last, float(longer.law.knots[-2])) if longer.target == 0.0 else last)]
         # If the law stops before the end, check the rest at full speed. A faster law would be sampled again later.
         if not math.isfinite(last):
-            law, first, last = constant_law(1.0), s, longer.path.duration
-        return self._checker.sample(longer.path, law, first, last, nominal_motion(run.path, s).pose).within_limits
+            sampled.append((constant_law(1.0), s, longer.path.duration))
+        pose = nominal_motion(run.path, s).pose
+        return all(
+            self._checker.sample(longer.path, law, begin, end, pose).within_limits
+            for law, begin, end in sampled
+            if math.isfinite(begin)
+        )

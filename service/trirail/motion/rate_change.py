@@ -25,13 +25,21 @@ MAX_POSTPONEMENTS = 3
 """Greatest number of times that the start of a law is postponed, to leave enough cycles for sampling the whole law."""
 
 
+class _Part(NamedTuple):
+    """Part of a path under a law, between two times of the law [s]."""
+
+    path: Path
+    first: float
+    until: float
+
+
 class _Candidate(NamedTuple):
     """Law that has been proposed but not completely sampled."""
 
     law: Path
     begins: int
     """Cycle of the schedule in which the law begins."""
-    ahead: list[tuple[float, float]]
+    ahead: list[_Part]
     """Parts of the law that have not been sampled yet, in reverse order."""
 
 
@@ -100,21 +108,20 @@ class RateChange:
         self._possible = self.rate
         self._share = 0
         self._candidate: _Candidate | None = None
-        self._unsampled: list[tuple[float, float]] | None = None
+        self._unsampled: list[_Part] | None = None
         self._first_s = 0.0
         if self.rate > 1.0 and schedule.runs:
             run = schedule.runs[-1]
             self._first_s = run.law_state.s if len(schedule.runs) == 1 else 0.0
             self._worst, self._leaves_at = np.zeros((len(SUBJECTS), 3)), math.nan
-            law = constant_law(1.0, self._first_s)
-            self._unsampled = parts(run.path, law, 0.0, run.path.duration - self._first_s, self._knots)[::-1]
+            self._unsampled = self._parts(run, constant_law(1.0, self._first_s), 1.0, math.inf)[::-1]
 
     def _search_greatest_rate(self, run: Run) -> None:
         """Sample one part of the remaining path. After the last part, compute the greatest possible rate."""
         if self._unsampled:
-            first, until = self._unsampled.pop()
+            path, first, until = self._unsampled.pop()
             result = self._scaling.sample(
-                run.path, constant_law(1.0, self._first_s), first, until, self._schedule.commanded.pose
+                path, constant_law(1.0, self._first_s), first, until, self._schedule.commanded.pose
             )
             np.maximum(result.worst, self._worst, out=self._worst)
             if not math.isnan(result.leaves_at):
@@ -135,13 +142,28 @@ class RateChange:
             self._next_share()
             return
         if candidate.ahead:
-            first, until = candidate.ahead.pop()
-            result = self._scaling.sample(run.path, candidate.law, first, until, self._schedule.commanded.pose)
+            path, first, until = candidate.ahead.pop()
+            result = self._scaling.sample(path, candidate.law, first, until, self._schedule.commanded.pose)
             if not result.within_limits:
                 self._next_share()
                 return
         if not candidate.ahead and candidate.begins == cycle:
             self._change_law(run, candidate.law)
+
+    def _parts(self, run: Run, law: Path, rate: float, last: float) -> list[_Part]:
+        """Return the parts of a law until the time `last` [s], on the path and on the paths that it may become.
+
+        If a following goal is dropped, the run continues under the same law on the path before this goal.
+        """
+        found = []
+        for path, first in (
+            (run.path, 0.0),
+            *((seam.before, arrival_time(law, rate, seam.s)) for seam in run.seams),
+        ):
+            until = min(arrival_time(law, rate, path.duration), last)
+            if first <= until:
+                found += [_Part(path, *each) for each in parts(path, law, first, until, self._knots)]
+        return found
 
     def _next_share(self) -> None:
         self._candidate, self._share = None, (self._share + 1) % len(CHANGE_SHARES)
@@ -157,7 +179,7 @@ class RateChange:
             law = self._scaling.ramp(at, self._possible, CHANGE_SHARES[self._share])
             if law is None or (self.applied and not self._stops_sooner(run, law, cycles)):
                 return None
-            ahead = parts(run.path, law, 0.0, self._scaling.last_new_time(run, law, self._possible), self._knots)
+            ahead = self._parts(run, law, self._possible, float(law.knots[-2]) + self._period)
             if len(ahead) <= cycles:
                 return _Candidate(law, self._schedule.cycle + cycles - 1, ahead[::-1])
             cycles = len(ahead)
