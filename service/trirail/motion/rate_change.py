@@ -79,7 +79,7 @@ class RateChange:
             self._restart()
         run = schedule.runs[-1]
         if self._unsampled is not None:
-            self._search_greatest_rate(run)
+            self._search_greatest_rate()
             return False
         if len(schedule.runs) > 1:
             self._change_law(run, constant_law(self._possible))
@@ -116,7 +116,7 @@ class RateChange:
             self._worst, self._leaves_at = np.zeros((len(SUBJECTS), 3)), math.nan
             self._unsampled = self._parts(run, constant_law(1.0, self._first_s), 1.0, math.inf)[::-1]
 
-    def _search_greatest_rate(self, run: Run) -> None:
+    def _search_greatest_rate(self) -> None:
         """Sample one part of the remaining path. After the last part, compute the greatest possible rate."""
         if self._unsampled:
             path, first, until = self._unsampled.pop()
