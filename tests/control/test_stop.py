@@ -227,6 +227,20 @@ def test_a_goal_sent_twice_and_then_paused_goes_on_when_it_is_resumed_and_ends_o
     assert rig.outcomes() == [("g2", "stopped"), ("g1", "done")]
 
 
+def test_a_disable_is_answered_though_the_robot_is_enabled_again_at_once(rig: ControlRig) -> None:
+    rig.enable()
+    rig.goal("g1", 0.05, 0.0, 0.0)
+    rig.cycles(100)
+    rig.cycle(CommandRequest(98, "ann", Command.DISABLE, carried("disable")))
+    rig.until(lambda: rig.mode is Mode.DISABLED)
+    rig.cycle(CommandRequest(99, "ann", Command.ENABLE, carried("enable")))
+    rig.cycles(20)
+    assert rig.holds()
+    assert isinstance(answer_to(rig, 98), Refused)
+    assert isinstance(answer_to(rig, 99), CommandDone)
+    assert not rig.control.ledger.busy
+
+
 @pytest.mark.parametrize("wait", [0, 3, 10, 30])
 def test_a_goal_that_is_sent_to_a_robot_that_pauses_is_not_paused(rig: ControlRig, wait: int) -> None:
     rig.enable()

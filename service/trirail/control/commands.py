@@ -65,6 +65,8 @@ def powered_up(now: CommandProgress) -> str | None:
 
 def powered_down(now: CommandProgress) -> str | None:
     """Return "" once the robot is at rest and no drive can move its slider any more."""
+    if now.mode not in (Mode.STOPPING, Mode.DISABLED, Mode.FAULT):
+        return "the robot was enabled again before all drives were without power"
     return _timed_out(now) or (None if now.mode is Mode.STOPPING or now.measured.powered else "")
 
 
