@@ -185,12 +185,14 @@ def test_a_recording_without_answers_is_planned_anew(recording: Recording, confi
 def test_on_simulated_drives_it_comes_out_the_same_too(recording: Recording, config: Config) -> None:
     """On a busy machine, the session's drives answered some cycles late, and a goal settled that much later.
 
-    Its last setpoint and the target that is held then differ by their rounding.
+    Its last setpoint and the target that is held then differ by their rounding, and setpoints that follow the measured
+    sliders by a count.
     """
     compared = replay_session(recording, config, simulated=True)
-    assert max(compared.position) < 1e-15
+    late = recording.records["age"].any()
+    assert max(compared.position) < (1.1 / abs(config.drives.A.counts_per_metre) if late else 1e-15)
     assert max(compared.velocity) < 1e-12
-    assert compared.differing == 0 or recording.records["age"].any()
+    assert compared.differing == 0 or late
 
 
 def test_a_motion_one_cycle_later_is_noticed(recording: Recording, config: Config) -> None:

@@ -155,15 +155,13 @@ class RateChange:
 
         If a following goal is dropped, the run continues under the same law on the path before this goal.
         """
-        found = []
-        for path, first in (
-            (run.path, 0.0),
-            *((seam.before, arrival_time(law, rate, seam.s)) for seam in run.seams),
-        ):
+        begins = [(run.path, 0.0), *((seam.before, arrival_time(law, rate, seam.s)) for seam in run.seams)]
+        sampled: list[_Part] = []
+        for path, first in begins:
             until = min(arrival_time(law, rate, path.duration), last)
             if first <= until:
-                found += [_Part(path, *each) for each in parts(path, law, first, until, self._knots)]
-        return found
+                sampled += [_Part(path, *each) for each in parts(path, law, first, until, self._knots)]
+        return sampled
 
     def _next_share(self) -> None:
         self._candidate, self._share = None, (self._share + 1) % len(CHANGE_SHARES)
