@@ -291,6 +291,7 @@ class GoalQueue:
         self._ledger.end(outcome, reason, but=number)
         self._schedule.drop(number - 1)
         self._planner.update_rate()
-        if self._planner.busy and self._planned is not None:  # it was to follow a goal that is dropped: plan it anew
+        if self._planner.busy and self._planned is not None:
+            # The goal in planning would follow a dropped goal, so it is planned again.
             self._planner.cancel()
             self._waiting.appendleft(self._planned)
