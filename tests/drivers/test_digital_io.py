@@ -194,13 +194,18 @@ def test_outputs_that_a_full_bus_refuses_are_sent_in_the_next_cycle(rig: Rig, mo
     assert rig.devices[0].pins.bits == VALVE
 
 
-def test_the_end_of_the_service_makes_outputs_safe(rig: Rig) -> None:
+def switched_on(rig: Rig) -> Rig:
+    """With power, and an output that is on where it is not safe."""
     ready(rig)
     rig.enable()
     rig.drives.set_outputs((VALVE, 0, 0))
-    rig.cycles(3)
+    rig.cycles(5)
     assert rig.devices[0].pins.bits == VALVE
-    rig.drives.close()
+    return rig
+
+
+def test_the_end_of_the_service_makes_outputs_safe(rig: Rig) -> None:
+    switched_on(rig).drives.close()
     assert rig.devices[0].pins.bits == LAMP
 
 
@@ -407,16 +412,6 @@ def test_inputs_have_a_pdo_of_their_own_where_the_statusword_has_none(closing: C
 
 
 # ---------------------------------------------------------------------- drives that miss outputs
-
-
-def switched_on(rig: Rig) -> Rig:
-    """With power, and an output that is on where it is not safe."""
-    ready(rig)
-    rig.enable()
-    rig.drives.set_outputs((VALVE, 0, 0))
-    rig.cycles(5)
-    assert rig.devices[0].pins.bits == VALVE
-    return rig
 
 
 @pytest.mark.parametrize("state", [Nmt.PRE_OPERATIONAL, Nmt.STOPPED])
