@@ -463,7 +463,11 @@ def test_outputs_by_sdo_go_on_after_an_answer_was_lost(rig: Rig) -> None:
     rig.drives.set_outputs((LAMP, 0, 0))
     rig.cycle()
     rig.bus.faults.clear()
-    for word in (VALVE, LAMP):
-        rig.drives.set_outputs((word, 0, 0))
-        rig.cycles(600)
-        assert a.pins.bits == word
+    rig.drives.set_outputs((VALVE, 0, 0))
+    rig.cycles(400)
+    assert a.pins.bits == LAMP  # the answer may still come: a server handles one request at a time
+    rig.cycles(200)
+    assert a.pins.bits == VALVE
+    rig.drives.set_outputs((LAMP, 0, 0))
+    rig.cycles(600)
+    assert a.pins.bits == LAMP
