@@ -20,7 +20,7 @@ from trirail.motion.paths import LAST_PIECE_S, Path, constant_law
 from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import Notice
-from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest, Request
+from trirail.wire.packets import Accepted, Answer, CommandRequest, Disturbance, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Mode, SetOutput
 from trirail_drivers.interface import Counts, DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
 
@@ -121,6 +121,8 @@ class ControlRig:
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
         self.rows: list[list[list[float]]] = []
+        self.more: list[Request | Disturbance] = []
+        """What comes in the next cycle beside its request, and before it."""
         self._tickets = itertools.count(1)
 
     @property
@@ -137,7 +139,8 @@ class ControlRig:
         control = self.control
         self.driver.sync()
         now_ns = round(self.now * 1e9)
-        given: list[TimedInput] = [] if request is None else [(request, now_ns)]
+        given: list[TimedInput] = [(each, now_ns) for each in (*self.more, request) if each is not None]
+        self.more.clear()
         given += [(answer, now_ns) for answer in self.planner.answers()]
         control.cycle(self.driver.read, given)
         self.rows.append(control.setpoints.rows)

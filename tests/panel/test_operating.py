@@ -54,6 +54,26 @@ def moving(robot: Robot) -> None:
     until(robot, lambda state: state.mode == "moving" and state.pose[0] > -0.095)
 
 
+def hold_right(robot: Robot, page: Page, *, touch: bool = False) -> None:
+    """Hold the button to the right until the robot has moved by 5 mm.
+
+    As a person would, press the button again if the jog has ended because a sign of life came late.
+    """
+    press, let_go = (page.touch, page.end_touch) if touch else (page.press, page.let_go)
+    start = standing(robot).pose[0]
+    press(RIGHT)
+
+    def has_moved(state: State) -> bool:
+        if state.mode == "moving" and state.pose[0] > start + 0.005:
+            return True
+        if not page.evaluate(f"document.querySelector({RIGHT!r}).matches('.held')"):
+            let_go()
+            press(RIGHT)
+        return False
+
+    until(robot, has_moved)
+
+
 def standing(robot: Robot) -> State:
     return until(robot, lambda state: state.mode == "holding" and state.goal is None)
 
@@ -100,12 +120,11 @@ def opened(browser: Page, url: str) -> Page:
 @needs_chromium
 def test_the_robot_is_jogged_and_stopped_by_clicking(service: Service, robot: Robot, browser: Page, panel: str) -> None:
     page = opened(browser, panel)
-    page.press(RIGHT)
-    moving(robot)
+    hold_right(robot, page)
     page.let_go()
     assert -0.095 < standing(robot).pose[0] < FAR
     goal = robot.move_to(x=0.1, y=0.0, phi=0.2, speed=0.1)
-    moving(robot)
+    until(robot, lambda state: state.mode == "moving")
     page.click("#stop")
     assert goal.wait(10.0).outcome == "stopped"
     page.until("document.querySelector('#mode-name').textContent === 'holding'")
@@ -125,8 +144,7 @@ def test_a_tab_that_is_gone_while_a_button_is_held_moves_nothing(
 ) -> None:
     with chromium("chromium", tmp_path, ["--disable-gpu"]) as browser:
         page = opened(browser, panel)
-        page.press(RIGHT)
-        moving(robot)
+        hold_right(robot, page)
         if gone == "closed":
             page.close()
         else:
@@ -146,8 +164,7 @@ def test_a_finger_that_is_lost_on_a_touch_screen_moves_nothing(
     with chromium("chromium", tmp_path, ["--disable-gpu"]) as browser:
         page = opened(browser, panel)
         page.resize(390, 844, phone=True)
-        page.touch(RIGHT)
-        moving(robot)
+        hold_right(robot, page, touch=True)
         if gone == "cancelled":
             page.end_touch("touchCancel")
         elif gone == "frozen":
@@ -197,8 +214,7 @@ def test_a_panel_that_is_gone_while_a_button_is_held_moves_nothing(
     """As where the network is: no renewal reaches the service."""
     with served(service) as (url, process):
         page = opened(browser, url)
-        page.press(RIGHT)
-        moving(robot)
+        hold_right(robot, page)
         process.send_signal(number)
         assert standing(robot).pose[0] < FAR
         page.until("document.querySelector('#mode-name').textContent === 'no contact'")
@@ -213,9 +229,7 @@ def test_a_panel_that_is_gone_while_a_button_is_held_moves_nothing(
 def test_two_tabs_both_work_and_either_stops(service: Service, robot: Robot, browser: Page, panel: str) -> None:
     one, other = opened(browser, panel), opened(browser, panel)
     for mover, stopper in ((one, other), (other, one)):
-        start = standing(robot).pose[0]
-        mover.press(RIGHT)
-        until(robot, lambda state, start=start: state.pose[0] > start + 0.005)  # type: ignore[misc]
+        hold_right(robot, mover)
         stopper.click("#stop")
         still(robot)
         mover.let_go()
