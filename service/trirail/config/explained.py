@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import functools
 import math
 import re
 from collections.abc import Iterable, Iterator
@@ -64,15 +65,18 @@ class _WrongValue(NamedTuple):
     """Expected type; None for an unknown key."""
 
 
+_type_info = functools.cache(mi.type_info)
+
+
 def wrong_values(raw: dict[str, Any], kind: type[msgspec.Struct]) -> list[Mistake]:
     """Return a mistake for each value in nested tables that `kind`, the type of the file, does not accept."""
-    return [Mistake(_key(wrong.place), wrong.text) for wrong in _wrong_values(raw, mi.type_info(kind), ())]
+    return [Mistake(_key(wrong.place), wrong.text) for wrong in _wrong_values(raw, _type_info(kind), ())]
 
 
 def repaired(raw: dict[str, Any]) -> tuple[Config, list[Mistake]]:
     """Return a configuration in which a valid value replaces each wrong one, and the list of mistakes."""
     tables, mistakes = copy.deepcopy(raw), list[Mistake]()
-    while wrong := list(_wrong_values(tables, mi.type_info(Config), ())):
+    while wrong := list(_wrong_values(tables, _type_info(Config), ())):
         for place, text, kind in wrong:
             table, key = _at(place[:-1], tables), _key(place)
             if kind is None:

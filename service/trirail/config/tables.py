@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 from typing import Annotated, Literal, cast
@@ -391,6 +392,7 @@ def metrics_url(config: Config) -> str:
     return url if telemetry.metrics_port else ""
 
 
+@functools.lru_cache(maxsize=32)  # every check of a configuration needs it, and it takes milliseconds
 def geometry(table: GeometryTable) -> Geometry:
     """Build the robot's geometry from its section. Raises ConfigError if the section is invalid."""
     if (table.l0 is None) == (table.leg is None):
