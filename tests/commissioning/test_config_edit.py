@@ -74,3 +74,8 @@ def test_eds_files_are_found_from_another_folder(tmp_path: Path) -> None:
     moved = tmp_path / "moved.toml"
     config_edit.write_new_file(moved, config_edit.resolve_eds_paths(text, tmp_path / "here"))
     assert load(moved).drives.B.eds == str(tmp_path / "here" / "maker.eds")
+
+
+def test_a_robot_with_a_correction_map_is_changed_too() -> None:
+    text = SIM.read_text(encoding="utf-8") + '[correction]\nmap = "errors.toml"\n'
+    assert config_edit.edit_text(text, {"drives.A.node": 9}) == text.replace("node = 1\n", "node = 9\n")

@@ -34,9 +34,17 @@ def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
             table.add(key, value)
     result = tomlkit.dumps(document)
     # tomlkit edits the text. Parse the result to check that nothing else has changed.
-    if parse(result) != replace_values(parse(text), changes):
+    if _without_map(result) != replace_values(_without_map(text), changes):
         raise ConfigError(f"changes {dict(changes)}: cannot be written to this file; edit it by hand")
     return result
+
+
+def _without_map(text: str) -> Config:
+    """Parse a configuration without its correction map, which can only be read together with the file."""
+    document = tomlkit.parse(text)
+    if "correction" in document:
+        document["correction"].pop("map", None)
+    return parse(tomlkit.dumps(document))
 
 
 def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | None) -> str:
