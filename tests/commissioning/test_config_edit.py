@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import operator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.commissioning import config_edit
-from trirail.config import SIM, load, parse
+from trirail.config import SIM, as_built, everything, geometry, load, parse
 from trirail.errors import ConfigError
+from trirail.kinematics.correction import Correction
 from trirail_drivers.interface import NAMES
 
 SHIPPED = sorted(SIM.parent.rglob("*.toml"))
@@ -68,12 +71,26 @@ def test_no_file_is_written_over(tmp_path: Path) -> None:
     assert first.read_text() == "precious"
 
 
-def test_eds_files_are_found_from_another_folder(tmp_path: Path) -> None:
-    text = SIM.read_text(encoding="utf-8").replace("[drives.B]\n", '[drives.B]\neds = "maker.eds"\n')
-    (tmp_path / "here").mkdir()
-    moved = tmp_path / "moved.toml"
-    config_edit.write_new_file(moved, config_edit.resolve_eds_paths(text, tmp_path / "here"))
-    assert load(moved).drives.B.eds == str(tmp_path / "here" / "maker.eds")
+@pytest.mark.parametrize(
+    ("section", "line", "key", "file"),
+    [
+        ("[drives.B]", 'eds = "maker.eds"', "drives.B.eds", "maker.eds"),
+        ("[drives.C]", 'endpoints = "flat.json"', "drives.C.endpoints", "flat.json"),
+        ("[correction]", 'map = "errors.toml"', "correction.map", "errors.toml"),
+        ("[zenoh.tls]", "", "zenoh.tls.directory", "keys"),
+        ("[zenoh.tls]", 'directory = "certificates"', "zenoh.tls.directory", "certificates"),
+    ],
+)
+def test_files_are_found_from_another_folder(tmp_path: Path, section: str, line: str, key: str, file: str) -> None:
+    here, moved = tmp_path / "here", tmp_path / "moved.toml"
+    here.mkdir()
+    errors = Correction((-1.0,) * 3, (1.0,) * 3, np.zeros((4, 4, 4, 3)))
+    made = as_built.measured_today(errors, geometry(load(SIM).geometry))
+    (here / "errors.toml").write_text(as_built.format_map(made), encoding="utf-8")
+    text = SIM.read_text(encoding="utf-8")
+    text = text.replace(f"{section}\n", f"{section}\n{line}\n") if section in text else f"{text}{section}\n{line}\n"
+    config_edit.write_new_file(moved, config_edit.resolve_paths(text, here))
+    assert operator.attrgetter(key)(everything(moved).config) == str(here / file)
 
 
 def test_a_robot_with_a_correction_map_is_changed_too() -> None:

@@ -178,11 +178,11 @@ def _write(
     written = out or config_edit.find_free_path(path, "calibrated")
     map_path = written.with_name(f"{written.stem}-map.toml") if errors is not None else None
     text = path.read_text(encoding="utf-8")
+    if written.parent.resolve() != path.parent.resolve():
+        text = config_edit.resolve_paths(text, path.parent)
     text = config_edit.edit_geometry(text, result.geometry, result.scales, map_path.name if map_path else None)
     if settings.can.interface == "simulated" and settings.can.simulated.built is None:
         text = config_edit.add_simulated_build(text, settings.drives)
-    if written.parent.resolve() != path.parent.resolve():
-        text = config_edit.resolve_eds_paths(text, path.parent)
     if map_path is not None and errors is not None:
         config_edit.write_new_file(map_path, as_built.format_map(errors))
     config_edit.write_new_file(written, text)

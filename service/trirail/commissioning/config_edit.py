@@ -11,7 +11,7 @@ from tomlkit.items import Table
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES, Triple
 
-from trirail.config import Config, geometry, parse
+from trirail.config import Config, Tls, geometry, parse
 from trirail.config.as_built import geometry_of
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry
@@ -123,13 +123,19 @@ def add_simulated_build(text: str, drives: Drives) -> str:
     return tomlkit.dumps(document)
 
 
-def resolve_eds_paths(text: str, folder: Path) -> str:
-    """Return a configuration's text with absolute EDS paths of the drives, which were relative to `folder`."""
+def resolve_paths(text: str, folder: Path) -> str:
+    """Return a configuration's text with absolute paths of the files that it needs, which were relative to `folder`."""
     document = tomlkit.parse(text)
-    for name in NAMES:
-        drive = document["drives"][name]
-        if "eds" in drive:
-            drive["eds"] = str((folder / str(drive["eds"])).resolve())
+    tables = [document["drives"][name] for name in NAMES]
+    named = [(table, key) for table in tables for key in ("eds", "endpoints")]
+    named.append((document.get("correction", {}), "map"))
+    if "tls" in document.get("zenoh", {}):
+        tls = document["zenoh"]["tls"]
+        tls.setdefault("directory", Tls().directory)
+        named.append((tls, "directory"))
+    for table, key in named:
+        if key in table:
+            table[key] = str((folder / str(table[key])).resolve())
     return tomlkit.dumps(document)
 
 

@@ -237,7 +237,7 @@ class Guide:
             if self._report_file.report.simulated and self._config.can.simulated.built is None:
                 text = config_edit.add_simulated_build(text, self._config.drives)
             if written.parent.resolve() != self._path.parent.resolve():
-                text = config_edit.resolve_eds_paths(text, self._path.parent)
+                text = config_edit.resolve_paths(text, self._path.parent)
             config_edit.write_new_file(written, text)
             self._operator.show("Corrected values:")
             for key, value in changes.items():
