@@ -20,8 +20,10 @@ from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.cli import mark_source
+from trirail.cli.app import app
 from trirail.cli.mark_source import MarkSource
 from trirail.client.client import Robot
+from trirail.config import SIM
 from trirail.errors import TrirailError
 from trirail_drivers.interface import Triple
 
@@ -330,3 +332,16 @@ def test_a_camera_that_is_not_there_is_named() -> None:
 def test_one_source_of_marks_is_wanted(given: tuple[str, ...], tmp_path: Path) -> None:
     done = trirail("align", "calibrate", tmp_path / "camera.json", *given, code=1)
     assert "give exactly one of" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "missing"),
+    [
+        (("calibrate", "absent/camera.json"), r"absent/camera\.json"),
+        (("geometry", SIM, "--field", "9", "9", "--calibration", "absent/camera.json"), r"absent/camera\.json"),
+        (("geometry", SIM, "--field", "9", "9", "--out", "absent/new.toml"), r"absent/new\.toml"),
+    ],
+)
+def test_a_folder_that_is_not_there_is_known_before_the_stage_moves(words: tuple[object, ...], missing: str) -> None:
+    with pytest.raises(TrirailError, match=f"{missing}: there is no folder absent"):
+        app(["align", *map(str, words), "--program", "true"])

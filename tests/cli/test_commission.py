@@ -102,6 +102,8 @@ def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path
     (tmp_path / "precious.toml").write_text("precious")
     with pytest.raises(ConfigError, match=r"precious\.toml already exists; choose another file with --out"):
         run(robot, "--out", "precious.toml")
+    with pytest.raises(ConfigError, match=r"absent/new\.toml: there is no folder absent"):
+        run(robot, "--out", "absent/new.toml")
     with pytest.raises(FileError, match=r"precious\.toml already exists; choose another file with --report"):
         run(robot, "--report", "precious.toml")
     with pytest.raises(FaultSyntaxError, match="did you mean reversed"):

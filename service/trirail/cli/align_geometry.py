@@ -74,13 +74,16 @@ def geometry(
         Write the files without asking.
     """
     from trirail.alignment.procedure import observe_mean
+    from trirail.client import calibration_file
     from trirail.client.alignment import drive
     from trirail.client.stage_geometry import geometry_task
+    from trirail.commissioning import config_edit
     from trirail.config import load
 
     settings = load(config)
-    if out is not None and out.exists():
-        raise ConfigError(f"{out} already exists; choose another file with --out")
+    if out is not None:
+        config_edit.check_new_file(out)
+    calibration_file.check_folder(calibration)
     way = approach[0], approach[1], notation.radians(approach[2], False)
     with source.open_source() as (look, known), service.open() as robot:
         _check_same(settings, config, robot)

@@ -65,6 +65,7 @@ def commission(
     json
         Print the report as one JSON object; all other output goes to standard error.
     """
+    from trirail.commissioning import config_edit
     from trirail.commissioning import report as reports
     from trirail.commissioning.guide import Guide
     from trirail.commissioning.opening import open_steps
@@ -77,8 +78,8 @@ def commission(
     if (yes or fault) and not simulated:
         option = "--yes" if yes else "--fault"
         raise ConfigError(f"{option} is only for simulated drives: a person must watch real drives")
-    if out is not None and out.exists():
-        raise ConfigError(f"{out} already exists; choose another file with --out")
+    if out is not None:
+        config_edit.check_new_file(out)
     name = f"commission-{settings.robot.name}-{time.strftime('%Y%m%d-%H%M%S')}.json"
     made = reports.CommissioningReport(settings.robot.name, str(config), reports.now(), simulated, str(software()))
     keeper = reports.ReportFile(made, report or Path(name))

@@ -58,6 +58,12 @@ def write(
         raise FileError(f"cannot write {path}: {error.strerror}") from error
 
 
+def check_folder(path: Path) -> None:
+    """Raise FileError if there is no folder for a calibration file, so that this is known before the stage moves."""
+    if not path.parent.is_dir():
+        raise FileError(f"{path}: there is no folder {path.parent}")
+
+
 def keep_old(path: Path) -> Path | None:
     """Copy a calibration file to NAME.old to preserve the taught targets; return the path of the copy.
 

@@ -151,6 +151,14 @@ def find_free_path(path: Path, word: str = "commissioned") -> Path:
     return free
 
 
+def check_new_file(path: Path) -> None:
+    """Raise ConfigError if `write_new_file` would refuse a path, which a long measurement must not find at its end."""
+    if path.exists():
+        raise ConfigError(f"{path} already exists; choose another file with --out")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path}: there is no folder {path.parent}")
+
+
 def write_new_file(path: Path, text: str) -> None:
     """Write a new file. Raises ConfigError if the file exists or cannot be written."""
     try:
