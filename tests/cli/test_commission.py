@@ -13,7 +13,7 @@ import pytest
 from trirail.cli import commission
 from trirail.cli.app import app
 from trirail.commissioning.person import Question, QuitRequest
-from trirail.config import SIM
+from trirail.config import SIM, load
 from trirail.errors import ConfigError
 from trirail_drivers.errors import FileError
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
@@ -63,6 +63,14 @@ def test_a_scripts_lines_are_the_answers_and_its_end_leaves(
     assert "wrong direction" in told.err
     assert (tmp_path / report["written"]).name == "robot-commissioned.toml"
     assert Path(robot).read_text(encoding="utf-8") == SIM.read_text(encoding="utf-8")
+
+
+def test_a_file_that_begins_with_a_byte_order_mark_is_corrected_too(robot: str, typed: int) -> None:
+    Path(robot).write_text(SIM.read_text(encoding="utf-8"), encoding="utf-8-sig")  # as editors of Windows write it
+    os.write(typed, "\n".join(["", "", *PUSH, "s"]).encode() + b"\n")
+    os.close(typed)
+    assert run(robot, "--fault", "A reversed", "--out", "new.toml") == 1
+    assert load(Path("new.toml")).drives.A.direction == -1
 
 
 def test_what_is_refused_step_by_step_leaves_nothing_wrong(

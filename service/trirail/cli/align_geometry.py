@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from cyclopts import Parameter
+from trirail_drivers import files
 
 from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.mark_source import MarkSource
@@ -180,7 +181,7 @@ def _write(
 
     written = out or config_edit.find_free_path(path, "calibrated")
     map_path = written.with_name(f"{written.stem}-map.toml") if errors is not None else None
-    text = path.read_text(encoding="utf-8")
+    text = files.text(path)
     if written.parent.resolve() != path.parent.resolve():
         text = config_edit.resolve_paths(text, path.parent)
     text = config_edit.edit_geometry(text, result.geometry, result.scales, map_path.name if map_path else None)

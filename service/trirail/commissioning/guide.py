@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from trirail_drivers import files
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
 
@@ -233,7 +234,7 @@ class Guide:
         written = None
         if changes:
             written = out or config_edit.find_free_path(self._path)
-            text = config_edit.edit_text(self._path.read_text(encoding="utf-8"), changes)
+            text = config_edit.edit_text(files.text(self._path), changes)
             if self._report_file.report.simulated and self._config.can.simulated.built is None:
                 text = config_edit.add_simulated_build(text, self._config.drives)
             if written.parent.resolve() != self._path.parent.resolve():
