@@ -114,6 +114,11 @@ def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path
         run(robot, "--out", "absent/new.toml")
     with pytest.raises(FileError, match=r"precious\.toml already exists; choose another file with --report"):
         run(robot, "--report", "precious.toml")
+    (tmp_path / "notes.txt").write_text("precious")
+    with pytest.raises(FileError, match=r"notes\.txt already exists; choose another file with --report"):
+        run(robot, "--report", "notes.json")
+    with pytest.raises(FileError, match=r"one\.txt is the name of the text version"):
+        run(robot, "--report", "one.txt")
     with pytest.raises(FaultSyntaxError, match="did you mean reversed"):
         run(robot, "--yes", "--fault", "A reverse", "--report", "a.json")
     real = tmp_path / "real.toml"
@@ -121,7 +126,7 @@ def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path
     for option in (["--yes"], ["--fault", "A loose"]):
         with pytest.raises(ConfigError, match=f"{option[0]} is only for simulated drives"):
             run(str(real), *option)
-    assert (tmp_path / "precious.toml").read_text() == "precious"
+    assert (tmp_path / "precious.toml").read_text() == (tmp_path / "notes.txt").read_text() == "precious"
 
 
 @pytest.mark.parametrize(

@@ -78,13 +78,16 @@ class ReportFile:
     """JSON file of a report, and a text file for people in the same folder."""
 
     def __init__(self, report: CommissioningReport, path: Path) -> None:
-        """Create the JSON file at `path`. Raises FileError if the file exists or cannot be created."""
+        """Create the JSON file at `path`. Raises FileError if one of the files exists or cannot be created."""
         self.report = report
         self.path = path
+        if path == self.text_path:
+            raise FileError(f"{path} is the name of the text version; choose another one with --report, as report.json")
+        for file in (path, self.text_path):
+            if file.exists():
+                raise FileError(f"{file} already exists; choose another file with --report")
         try:
             path.touch(exist_ok=False)
-        except FileExistsError:
-            raise FileError(f"{path} already exists; choose another file with --report") from None
         except OSError as error:
             raise FileError(f"{path}: {error.strerror}") from error
 
