@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -83,6 +84,18 @@ def test_what_is_refused_step_by_step_leaves_nothing_wrong(
     assert (report["ok"], report["complete"], report["written"]) == (True, False, None)
     assert {step["verdict"] for step in report["steps"][2:]} == {"skipped"}
     assert len(list(tmp_path.glob("commission-demo-*.json"))) == len(list(tmp_path.glob("commission-demo-*.txt"))) == 1
+
+
+def test_back_leads_past_steps_that_cannot_run(robot: str, typed: int, capsys: pytest.CaptureFixture[str]) -> None:
+    os.write(
+        typed, b"\n\n" + b"s\n" * 6 + b"b\nq\n"
+    )  # nothing has had power, so no drive may move: b from the switches
+    os.close(typed)
+    assert run(robot) == 0
+    assert re.findall(r"^\d+/\d+  (.*)$", capsys.readouterr().out, re.MULTILINE)[-2:] == [
+        "Switches of slider A",
+        "Power on drive C alone",
+    ]
 
 
 @pytest.mark.parametrize("done", [[], ["bus"], ["bus", "setup"]], ids=["at once", "before set-up", "afterwards"])

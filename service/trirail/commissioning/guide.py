@@ -219,7 +219,10 @@ class Guide:
             if step.name == "setup":
                 for line in self._steps.session.describe_setup():
                     self._operator.show(f"  {line}")
-            at = self._run_step(step, at)
+            if self._run_step(step):
+                at += 1
+            else:  # a step that cannot run would only lead forward again
+                at = max((k for k in range(at) if not self._missing(plan[k])), default=0)
 
     def write(self, out: Path | None) -> Path | None:
         """Write the corrected configuration to `out`, or to an unused path in the folder of the original.
@@ -251,11 +254,8 @@ class Guide:
         self._report_file.conclude(changes, written)
         return written
 
-    def _run_step(self, step: GuideStep, at: int) -> int:
-        """Ask the person to run a step, skip it or return to the previous step; return the index of the next step.
-
-        `at` is the index of the step.
-        """
+    def _run_step(self, step: GuideStep) -> bool:
+        """Ask the person to run a step, skip it or return to the previous step; return False for the previous step."""
         choices = {"y": "run it", "s": "skip it", "b": "previous step"}
         choice = self._ask("  Run it? Enter or y, s skip, b back, q quit:", "y", choices)
         if choice == "s" and (step.name, step.drive) not in self._report_file.report.latest:
@@ -268,10 +268,10 @@ class Guide:
                 raise
             self._record(step, judgement, measured)
             if judgement.verdict == "ok":
-                return at + 1
+                return True
             choices = {"s": "continue", "y": "repeat it", "b": "previous step"}
             choice = self._ask("  Continue with the next step? Enter or s, y repeat, b back, q quit:", "s", choices)
-        return at + 1 if choice == "s" else max(0, at - 1)
+        return choice == "s"
 
     def _ask(self, text: str, default: str, choices: dict[str, str]) -> str:
         return ask_choice(self._operator, self._steps.session.idle, Question(text, default), choices)
