@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import itertools
 import json
 import math
 import random
@@ -15,6 +17,7 @@ import msgspec
 import pytest
 from control_rig import CONFIG
 from trirail.commissioning import bench as benches
+from trirail.commissioning import opening
 from trirail.commissioning.guide import Guide
 from trirail.commissioning.judgement import Judgement
 from trirail.commissioning.opening import open_steps
@@ -24,6 +27,7 @@ from trirail.commissioning.steps import Steps
 from trirail.config import SIM, Config, load
 from trirail_drivers import config
 from trirail_drivers.interface import NAMES, PowerState
+from trirail_drivers.protocols import CIA402
 from trirail_drivers.simulated import SimulatedBus, SimulatedDrive
 
 pytestmark = pytest.mark.long
@@ -307,6 +311,14 @@ def test_switches_that_are_not_seen_are_asked_about(tmp_path: Path, monkeypatch:
     answers = {"Switches that changed: none": ["n", "y"]}
     run = Run(tmp_path, person=Beside(["by hand", "Power"], answers))
     assert [run.of("switches", name).verdict for name in NAMES] == ["wrong", "ok", "ok"]
+
+
+def test_a_reading_that_fails_is_no_change_of_a_switch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    readings = itertools.cycle((4, None))  # each slider stands at its home switch
+    protocol = dataclasses.replace(CIA402, inputs=lambda *_: lambda _: next(readings))
+    monkeypatch.setattr(opening, "PROTOCOLS", {CIA402.name: protocol})
+    run = Run(tmp_path, person=Beside(["by hand", "Power"]))
+    assert run.of("switches", "A").measured == {"at_rest": 4, "changed": 0}
 
 
 def test_a_drive_that_breaks_down_is_named_and_the_step_can_be_repeated(tmp_path: Path) -> None:

@@ -106,8 +106,8 @@ class Steps:
             nonlocal changed, cycles
             self.session.idle()
             cycles += 1
-            if cycles % max(1, round(INPUT_POLL_S / bench.period)) == 0:
-                changed |= (read(name) or 0) ^ rest
+            if cycles % max(1, round(INPUT_POLL_S / bench.period)) == 0 and (bits := read(name)) is not None:
+                changed |= bits ^ rest
 
         if (press := self._environment.press) is None:
             text = f"Press each limit switch and the home switch of {slider} for a second, then press Enter"
