@@ -100,12 +100,15 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
         ("sleep 60", "no line in 0.05 s; check that it flushes"),
         ("/no/such/program", "cannot run"),
         ("""echo '{"left": [1, "a"]}'""", "expected"),
+        (r"""printf '{"\351": [1, 2]}\n'""", "expected"),  # not in UTF-8
+        (r"""printf '{"a": [1, 2]}\n{"a": [3, 4]}\n'""", "expected"),  # the second would be the answer to a later look
+        (r"""sh -c 'printf "{}"; sleep 60'""", "no line in 0.05 s"),
     ],
 )
 def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(
     program: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if program.startswith("sleep"):
+    if "sleep" in program:
         monkeypatch.setattr(mark_source, "PICTURE_TIMEOUT_S", 0.05)
 
     def look() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import math
+import os
 import select
 import shlex
 import subprocess
@@ -35,6 +36,8 @@ PICTURE_TIMEOUT_S, WRITE_TIMEOUT_S, POLL_S = 30.0, 1.0, 0.02
 """Maximum wait for a line or a newer picture, maximum time to write a picture, and polling interval [s]."""
 EXIT_TIMEOUT_S = 5.0
 """Maximum time that a program may take to exit after SIGTERM [s]."""
+PIPE_BYTES = 65536
+"""Maximum size of one read from a program [bytes]."""
 INSTALL = "pip install 'trirail[vision]'"
 BUFFERED_S, MAX_BUFFERED = 0.002, 16
 """Reading time below which a picture counts as buffered by the driver [s], and maximum number of buffered pictures."""
@@ -70,10 +73,8 @@ def program(command: str) -> Iterator[Source]:
     """
     try:
         # The program gets its own process group: Ctrl-C goes to trirail, which ends the program.
-        process = subprocess.Popen(
-            shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0
-        )
-        stdin, stdout = cast(IO[str], process.stdin), cast(IO[str], process.stdout)
+        process = subprocess.Popen(shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0)
+        stdin, stdout = cast(IO[bytes], process.stdin), cast(IO[bytes], process.stdout)
     except (OSError, ValueError) as error:
         raise TrirailError(
             f"cannot run {command!r}: {error}; the program must print one line of JSON for each look"
@@ -81,13 +82,17 @@ def program(command: str) -> Iterator[Source]:
 
     def find_marks() -> Marks:
         with contextlib.suppress(BrokenPipeError):  # it has exited; its last line may still be in the pipe
-            stdin.write("look\n")
+            stdin.write(b"look\n")
             stdin.flush()
-        if not select.select([stdout], [], [], PICTURE_TIMEOUT_S)[0]:
-            raise TrirailError(
-                f"{command!r} has printed no line in {PICTURE_TIMEOUT_S:g} s; check that it flushes its output"
-            )
-        line = stdout.readline()
+        deadline, line = time.monotonic() + PICTURE_TIMEOUT_S, b""
+        while not line.endswith(b"\n"):
+            if not select.select([stdout], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                raise TrirailError(
+                    f"{command!r} has printed no line in {PICTURE_TIMEOUT_S:g} s; check that it flushes its output"
+                )
+            if not (part := os.read(stdout.fileno(), PIPE_BYTES)):
+                break
+            line += part
         if not line:
             code = process.wait(EXIT_TIMEOUT_S)
             raise TrirailError(
@@ -97,7 +102,8 @@ def program(command: str) -> Iterator[Source]:
             marks: Marks = decoded(line, LINE)
         except (msgspec.MsgspecError, ValueError) as error:
             wanted = 'expected {"mark": [u, v], …} in pixels'
-            raise TrirailError(f"{command!r} printed {line.strip()[:80]!r}: {error}; {wanted}") from error
+            printed = line.decode(errors="replace").strip()[:80]
+            raise TrirailError(f"{command!r} printed {printed!r}: {error}; {wanted}") from error
         return marks
 
     try:
