@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -188,6 +189,9 @@ def test_pictures_that_are_not_taken_anew_or_are_none_are_named(
         assert look() == {}
         with pytest.raises(TrirailError, match="no newer pictures"):
             look()
+        with monkeypatch.context() as waiting:  # it is written anew, after the clock was set back
+            waiting.setattr("time.sleep", lambda _: os.utime(tmp_path / "left.png", (1.0, 1.0)))
+            assert look() == {}
     (tmp_path / "left.png").write_bytes(b"cut off")
     with (
         mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _),

@@ -143,7 +143,7 @@ def folder(
     def find_marks() -> Marks:
         deadline = time.monotonic() + PICTURE_TIMEOUT_S
         asked = {each: _written(each) for each in used}
-        while any(_written(each) <= at for each, at in asked.items()):
+        while any(_written(each) in (0, at) for each, at in asked.items()):
             if time.monotonic() > deadline:
                 raise TrirailError(
                     f"{path}: no newer pictures within {PICTURE_TIMEOUT_S:g} s; check that the program that takes them "
@@ -281,7 +281,10 @@ def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.mon
 
 
 def _written(file: Path) -> int:
-    """Return the time of the last write to a file [ns]; 0 if it does not exist."""
+    """Return the time of the last write to a file [ns]; 0 if it does not exist.
+
+    A later write may have an earlier time, if the clock was set or the time is that of another machine.
+    """
     try:
         return file.stat().st_mtime_ns
     except OSError:
