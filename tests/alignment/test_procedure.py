@@ -132,6 +132,19 @@ def test_a_confirmed_calibration_goes_all_the_way() -> None:
     assert [c.share for c in found.corrections] == [1.0]
 
 
+@given(SEEDS, st.booleans())
+def test_two_names_of_one_mark_are_refused_and_nothing_moves(seed: int, seen_twice: bool) -> None:
+    """Two windows on one mark, as they were calibrated and taught, or a target that was copied to another name."""
+    rng = np.random.default_rng(seed)
+    part = {"left": PART["left"], "right": PART["left"] if seen_twice else PART["right"]}
+    stage = Stage(dict.fromkeys(part, camera(rng, part["left"])), part, rng)
+    calibration = stage.drive(calibrate_by_moves())
+    targets, moved = dict.fromkeys(part, stage.look()["left"]), stage.motions
+    with pytest.raises(AlignmentError, match="left and right have their targets at the same place") as refused:
+        stage.drive(align(AlignmentTask(calibration, targets)))
+    assert (refused.value.fault, stage.motions) == (AlignmentFault.MISSING, moved)
+
+
 @given(SEEDS, st.floats(1.05e-3, 0.05), st.booleans())
 def test_a_part_of_another_size_is_refused_with_the_number_and_nothing_moves(
     seed: int, share: float, less: bool

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,10 @@ MIN_MARKS = 2
 """Least number of marks that determine the position and the angle of a part."""
 DEFAULT_DISTANCE_ERROR = 1000e-6
 """Default of the greatest relative error of a distance between two marks, equivalent to 100 µm over 100 mm."""
+
+
+SAME_PLACE_M = 1e-6
+"""Distance of two targets below which they belong to a single mark [m]."""
 
 
 class Misalignment(NamedTuple):
@@ -79,8 +84,8 @@ def measure_misalignment(
     Raises
     ------
     AlignmentError
-        Fewer than two marks were found, a target has no calibrated mark, a distance between marks is wrong, or marks
-        are swapped.
+        Fewer than two marks were found, a target has no calibrated mark, two targets are at the same place, a distance
+        between marks is wrong, or marks are swapped.
     """
     check_targets_known(calibration, targets)
     names = tuple(sorted(set(marks) & set(targets)))
@@ -92,6 +97,12 @@ def measure_misalignment(
     views = [calibration.views[calibration.marks[name].view] for name in names]
     at = _locate_marks(views, [marks[name] for name in names])
     to = _locate_marks(views, [targets[name] for name in names])
+    for (one, place), (other, beside) in itertools.combinations(zip(names, to, strict=True), 2):
+        if np.linalg.norm(place - beside) < SAME_PLACE_M:
+            text = (
+                f"marks {one} and {other} have their targets at the same place; check that each name has its own mark"
+            )
+            raise AlignmentError(AlignmentFault.MISSING, text)
     # Check for swapped marks before the check of distances, which may also fail but would not name the cause.
     order = find_swap(at, to)
     if order is not None:
