@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from trirail.alignment.calibration_diff import ViewChange, compare_views
 from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.images import CameraView, Pair
-from trirail.alignment.procedure import calibrate_by_moves, repeat_calibration
+from trirail.alignment.procedure import calibrate_by_moves, calibration_moves, repeat_calibration
 from trirail.alignment.rigid_motion import rotation_matrix
 
 PART: dict[str, Pair] = {"left": (-0.06, 0.01), "right": (0.06, 0.01)}
@@ -57,6 +57,20 @@ def test_a_turn_and_another_scale_are_told(seed: int, change: Pair) -> None:
 @given(seeds)
 def test_cameras_that_stand_as_they_did_are_not_told_of(seed: int) -> None:
     assert not any(each.is_changed for each in compared(seed))
+
+
+@given(seeds, st.floats(-0.01, 0.01), st.floats(-0.01, 0.01))
+def test_another_part_in_perspective_is_no_other_camera(seed: int, x: float, y: float) -> None:
+    """The scale in the picture depends on the place of the part, and so does its doubt."""
+    rng = np.random.default_rng(seed)
+    views = {
+        name: msgspec.structs.replace(camera(rng, place), lens="perspective", bend=(2.0, -1.0))
+        for name, place in PART.items()
+    }
+    stage = Stage(views, PART, rng, noise=0.1)
+    kept = stage.drive(calibrate_by_moves(calibration_moves("perspective", 1e-3, 0.02), lens="perspective"))
+    stage.part = part_at(PART, (x, y, 0.0))
+    assert not any(each.is_changed for each in compare_views(kept, stage.drive(repeat_calibration(kept))))
 
 
 def test_deviations_are_those_of_many_trials() -> None:

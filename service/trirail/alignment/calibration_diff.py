@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from trirail.alignment.camera_calibration import CameraCalibration, to_base_frame
-from trirail.alignment.images import Pair, locate_pixels, project_points
+from trirail.alignment.images import CameraView, Pair, locate_pixels, project_points, projection_jacobians
 from trirail.alignment.rigid_motion import Floats
 
 SIGNIFICANT_DEVIATIONS = 5.0
@@ -66,9 +66,9 @@ def _compare_view(saved: CameraCalibration, current: CameraCalibration, view: st
     deviation = np.hypot(_place_deviations(saved, view), _place_deviations(current, view))
     # Apart from mirroring and skew, each map corresponds to a complex number. The argument of the ratio of both numbers
     # is the rotation, and the absolute value is the scale.
-    ratio = np.array(after.matrix) @ np.linalg.inv(np.array(before.matrix))
+    ratio = np.array(after.matrix) @ np.linalg.inv(_matrix_at(before, after.origin))
     rotation = complex(ratio[0, 0] + ratio[1, 1], ratio[1, 0] - ratio[0, 1]) / 2.0
-    map_deviation = math.hypot(*(_map_deviation(each, view) for each in (saved, current)))
+    map_deviation = math.hypot(*(_map_deviation(each, view, after.origin) for each in (saved, current)))
     return ViewChange(
         view,
         (float(shift[0]), float(shift[1])),
@@ -84,8 +84,23 @@ def _place_deviations(calibration: CameraCalibration, view: str) -> Floats:
     return np.asarray(np.max([mark.deviation for mark in calibration.marks.values() if mark.view == view], axis=0))
 
 
-def _map_deviation(calibration: CameraCalibration, view: str) -> float:
-    """Return the standard deviation of the rotation of a view [rad], which equals that of the relative scale."""
-    # Entries 2 to 5 of the unknowns are the elements of M, row by row.
-    variances = np.diag(np.array(calibration.covariances[view]))[2:6]
-    return float(np.sqrt(variances.sum() / 2.0)) / calibration.views[view].scale / math.sqrt(2.0)
+def _matrix_at(view: CameraView, origin: Pair) -> Floats:
+    """Return the matrix M of the same view for another point o, on which M depends in perspective."""
+    if view.lens != "perspective":
+        return np.array(view.matrix)
+    return np.asarray(projection_jacobians(view, np.array([origin]))[0])
+
+
+def _map_deviation(calibration: CameraCalibration, view: str, origin: Pair) -> float:
+    """Return the standard deviation of the rotation of a view [rad], which equals that of the relative scale.
+
+    In perspective, both also depend on g if the point o is another one. The deviation of the scale is then greater by
+    1.5 times the distance of the points times the deviation of g.
+    """
+    # Entries 2 to 5 of the unknowns are the elements of M, row by row; in perspective, entries 6 and 7 are g.
+    variances = np.diag(np.array(calibration.covariances[view]))
+    own = calibration.views[view]
+    deviation = float(np.sqrt(variances[2:6].sum() / 2.0)) / own.scale / math.sqrt(2.0)
+    if own.lens != "perspective":
+        return deviation
+    return math.hypot(deviation, 1.5 * math.dist(origin, own.origin) * math.sqrt(variances[6:8].max()))
