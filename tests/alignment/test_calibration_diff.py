@@ -73,6 +73,24 @@ def test_another_part_in_perspective_is_no_other_camera(seed: int, x: float, y: 
     assert not any(each.is_changed for each in compare_views(kept, stage.drive(repeat_calibration(kept))))
 
 
+@given(seeds, st.floats(-100.0, 100.0), st.floats(-100.0, 100.0))
+def test_each_radial_camera_keeps_its_own_centre(seed: int, u: float, v: float) -> None:
+    """As the calibration of a stage's geometry finds them."""
+    rng = np.random.default_rng(seed)
+    views = {
+        name: msgspec.structs.replace(
+            view, lens="radial", bend=(1e-7, 0.0), centre=(view.pixel[0] + u, view.pixel[1] + v)
+        )
+        for name, view, (u, v) in zip(PART, (camera(rng, p) for p in PART.values()), ((u, v), (-u, -v)), strict=True)
+    }
+    stage = Stage(views, PART, rng, noise=0.1)
+    centres = {name: view.centre for name, view in views.items()}
+    kept = stage.drive(calibrate_by_moves(calibration_moves("radial", 1e-3, 0.02), lens="radial", centre=centres))
+    again = stage.drive(repeat_calibration(kept))
+    assert {name: view.centre for name, view in again.views.items()} == centres
+    assert not any(each.is_changed for each in compare_views(kept, again))
+
+
 def test_deviations_are_those_of_many_trials() -> None:
     """What is said to be the doubt is it: shift, turn and scale scatter by it."""
     found = [compared(seed)[0] for seed in range(80)]

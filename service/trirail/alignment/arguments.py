@@ -75,11 +75,12 @@ def check_views(value: object) -> None:
 
 
 def check_lens(lens: object, centre: object) -> None:
-    """Raise RefusedError unless `lens` is one of LENSES and `centre` is a pixel (u, v)."""
+    """Raise RefusedError unless `lens` is one of LENSES and `centre` is a pixel (u, v), or one for each view."""
     if lens not in LENSES:
         _refuse(lens, "lens", f"one of {', '.join(LENSES)}")
-    if parse_pixel(centre) is None:
-        _refuse(centre, "centre", "two finite pixels (u, v)")
+    for each in centre.values() if isinstance(centre, Mapping) else (centre,):
+        if parse_pixel(each) is None:
+            _refuse(each, "centre", "two finite pixels (u, v)")
 
 
 def check_targets(value: object) -> None:

@@ -42,7 +42,7 @@ def calibrate_by_moves(
     moves: Sequence[Triple] = DEFAULT_MOVES,
     views: Mapping[str, str] | None = None,
     lens: Lens = "affine",
-    centre: Pair = (0.0, 0.0),
+    centre: Pair | Mapping[str, Pair] = (0.0, 0.0),
     looks: int = 1,
     approach: Triple | None = None,
 ) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
@@ -95,8 +95,10 @@ def repeat_calibration(
     x, y, phi = saved.poses[0]
     moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in saved.poses[1:]]
     views = {name: mark.view for name, mark in saved.marks.items()}
-    view = next(iter(saved.views.values()))
-    return (yield from calibrate_by_moves(moves, views, view.lens, view.centre, looks))
+    lens = next(iter(saved.views.values())).lens
+    # Each view has its own centre if the geometry of the stage was calibrated with it.
+    centres = {name: view.centre for name, view in saved.views.items()}
+    return (yield from calibrate_by_moves(moves, views, lens, centres, looks))
 
 
 def _add(a: Triple, b: Triple) -> Triple:

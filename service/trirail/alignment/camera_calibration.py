@@ -90,7 +90,7 @@ def calibrate(
     samples: Sequence[CalibrationSample],
     views: Mapping[str, str] | None = None,
     lens: Lens = "affine",
-    centre: Pair = (0.0, 0.0),
+    centre: Pair | Mapping[str, Pair] = (0.0, 0.0),
     looks: int = 1,
 ) -> CameraCalibration:
     """Compute the calibration from the marks that were observed at several poses.
@@ -105,7 +105,7 @@ def calibrate(
     lens
         Kind of the lens of all views.
     centre
-        Pixel on the axis of a radial lens.
+        Pixel on the axis of a radial lens, for all views or for each view by its name.
     looks
         Number of pictures that were averaged in each sample.
 
@@ -126,7 +126,9 @@ def calibrate(
         view: _ViewFit(
             samples,
             [name for name in names if view_of[name] == view],
-            CameraView((0, 0), (0, 0), ((1, 0), (0, 1)), lens, centre=centre),
+            CameraView(
+                (0, 0), (0, 0), ((1, 0), (0, 1)), lens, centre=centre[view] if isinstance(centre, Mapping) else centre
+            ),
             view,
         )
         for view in sorted({view_of[name] for name in names})
