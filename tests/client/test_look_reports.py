@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from trirail.alignment.images import Pair
 from trirail.alignment.procedure import Alignment, AlignmentTask, StageMotion, align, calibrate_by_moves, measure_part
 from trirail.client.alignment import UnrecordedAlignmentWarning, drive, drive_async, goals
-from trirail.errors import AlignmentError, RefusalCode, RefusedError, ServiceError
+from trirail.errors import AlignmentError, RefusalCode, RefusedError, ServiceError, WaitTimeoutError
 from trirail.wire import boundary
 from trirail.wire.looks import AlignmentLook
 from trirail_drivers.interface import Triple
@@ -32,6 +32,8 @@ class Told:
         self.stage = Stage({name: camera(rng, place) for name, place in PART.items()}, PART, rng, 0.05)
         self.looks: list[AlignmentLook] = []
         self.trouble: ServiceError | None = None
+        self.takes = 1.0
+        """Duration of each motion [s]."""
 
     def state(self) -> Any:
         return SimpleNamespace(pose=self.stage.pose, sliders=SimpleNamespace(position=(0.0, 0.0, 0.0)))
@@ -39,7 +41,15 @@ class Told:
     def send(self, goal: Any) -> Any:
         motion = (goal.x, goal.y, goal.phi)
         self.stage.go(StageMotion(motion, getattr(goal, "tool", None)))
-        return SimpleNamespace(wait=lambda _: SimpleNamespace(outcome="done"), result=None)
+        return SimpleNamespace(wait=self._wait, result=None, duration=self.takes)
+
+    def _wait(self, timeout: float) -> Any:
+        if timeout < self.takes:
+            raise WaitTimeoutError(f"not ended within {timeout:g} s")
+        return SimpleNamespace(outcome="done")
+
+    def stop(self) -> None:
+        pass
 
     def _report_look(self, message: bytes) -> None:
         if self.trouble is not None:
@@ -47,7 +57,13 @@ class Told:
         self.looks.append(boundary.decode(message, AlignmentLook, "no look"))
 
     def drive(self, wishes: Any, look: Callable[[], Any] | None = None) -> Any:
-        return drive(self, look or self.stage.look, wishes, 1.0, 0.0)  # type: ignore[arg-type]
+        return drive(self, look or self.stage.look, wishes, 1.0, 0.0)
+
+
+def test_a_slow_motion_has_its_time() -> None:
+    told = Told(1)
+    told.takes = 1000.0
+    assert told.drive(calibrate_by_moves()).marks.keys() == PART.keys()
 
 
 def task(told: Told, error: Triple) -> AlignmentTask:
@@ -159,7 +175,7 @@ def test_an_event_loop_tells_the_same() -> None:
 
         async def send(self, goal: Any) -> Any:
             told.send(goal)
-            return SimpleNamespace(wait=self._done, result=None)
+            return SimpleNamespace(wait=self._done, result=None, duration=1.0)
 
         async def _done(self, _: float) -> Any:
             return SimpleNamespace(outcome="done")
@@ -203,7 +219,7 @@ def test_an_interrupted_motion_is_stopped_and_waited_for(motion: int, place: str
             def wait(_: float) -> Any:
                 raise error
 
-            return SimpleNamespace(wait=wait, result=None)
+            return SimpleNamespace(wait=wait, result=None, duration=1.0)
 
         def stop(self) -> None:
             stops.append(sent)

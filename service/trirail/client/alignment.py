@@ -37,7 +37,7 @@ Look = Callable[[], Marks | Awaitable[Marks]]
 A coroutine function is allowed with AsyncRobot only."""
 EMPTY_OBSERVATION = Observation({}, (0.0, 0.0, 0.0), 0.0)
 GOAL_WITHIN = 60.0
-"""Time-out of one motion [s]."""
+"""Longest time from the expected end of a motion to its end [s]."""
 ENDS_AT_TARGET = ("done", "unsettled")
 """Outcomes of a goal that leave the robot at or near its target. The next look measures the remaining distance."""
 
@@ -48,6 +48,10 @@ class MotionHandle(Protocol):
     @property
     def result(self) -> Result | None:
         """Result of the goal; None before its end."""
+
+    @property
+    def duration(self) -> float | None:
+        """Expected time from acceptance to the end of the path [s]; None at override zero."""
 
     def wait(self, timeout: float | None = None) -> Result | Awaitable[Result]:
         """Wait for the end of the goal."""
@@ -169,7 +173,7 @@ async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
     handle: MotionHandle | None = None
     try:
         handle = await completed(robot.send(structs.replace(goal, id=goal_id)))
-        check(await completed(handle.wait(GOAL_WITHIN)))
+        check(await completed(handle.wait((handle.duration or 0.0) + GOAL_WITHIN)))
     except RefusedError:  # the goal was refused or has ended
         raise
     except BaseException:  # even without a reply, the goal may have been accepted
