@@ -227,6 +227,10 @@ def test_a_map_that_helps_is_written_beside_the_configuration_that_names_it(tmp_
     read = load(out).correction.as_built  # allowed with the new geometry and the limits
     assert read is not None
     assert as_built.format_map(read) == as_built.format_map(usable)
+    out.rename(config)  # the map stays, under the name by which the configuration finds it
+    again = align_geometry._write(found, config, settings, out, tmp_path / "camera.json", stage.look(), usable)
+    assert again.map == tmp_path / "new-map-2.toml"
+    assert load(out).correction.map == str(again.map)
     without = align_geometry._write(
         found, config, settings, tmp_path / "plain.toml", tmp_path / "camera.json", stage.look(), None
     )

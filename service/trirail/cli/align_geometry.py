@@ -180,7 +180,7 @@ def _write(
     from trirail.config import as_built
 
     written = out or config_edit.find_free_path(path, "calibrated")
-    map_path = written.with_name(f"{written.stem}-map.toml") if errors is not None else None
+    map_path = config_edit.find_free_path(written, "map") if errors is not None else None
     text = files.text(path)
     if written.parent.resolve() != path.parent.resolve():
         text = config_edit.resolve_paths(text, path.parent)

@@ -140,7 +140,7 @@ def resolve_paths(text: str, folder: Path) -> str:
 
 
 def find_free_path(path: Path, word: str = "commissioned") -> Path:
-    """Return an unused path for a corrected configuration, in the folder of the original `path`.
+    """Return an unused path for a file that belongs to a configuration, in the folder of the configuration's `path`.
 
     The file's name contains `word`.
     """
