@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import queue
 import subprocess
@@ -270,6 +271,10 @@ def test_one_camera_that_shows_several_marks_is_opened_once_and_read_once_a_look
         ({"camera": ("a=0",), "window": ("a=0,0,-9,9",)}, "expected MARK=U,V,WIDTH,HEIGHT"),
         ({"camera": ("a",)}, "expected MARK=DEVICE"),
         ({"program": "true", "window": ("a=0,0,9,9",)}, "--window is only for pictures"),
+        ({"pictures": SIM.parent, "size": 0.0}, "--size 0: expected a number of pixels above 0"),
+        ({"pictures": SIM.parent, "size": -5.0}, "--size -5: expected a number of pixels above 0"),
+        ({"pictures": SIM.parent, "size": math.nan}, "--size nan: expected a number of pixels above 0"),
+        ({"pictures": SIM.parent, "turn": math.inf}, "--turn inf: expected a finite number of degrees"),
     ],
 )
 def test_what_cannot_be_meant_of_a_source_is_said(options: dict[str, Any], words: str) -> None:

@@ -346,6 +346,10 @@ class MarkSource:
         selected = [self.program is not None, self.pictures is not None, bool(self.camera)]
         if sum(selected) != 1:
             raise TrirailError("marks have one source: give exactly one of --program, --pictures and --camera")
+        if not 0.0 < self.size < math.inf:
+            raise TrirailError(f"--size {self.size:g}: expected a number of pixels above 0")
+        if not math.isfinite(self.turn):
+            raise TrirailError(f"--turn {self.turn:g}: expected a finite number of degrees")
         shape, turn = MarkShape(self.shape, self.size), math.radians(self.turn)
         family = self.family if self.shape == "code" else None
         if family is not None and self.window:
