@@ -270,6 +270,8 @@ def test_one_camera_that_shows_several_marks_is_opened_once_and_read_once_a_look
         ({"camera": ("a=0",), "window": ("a=0,0,9",)}, "expected MARK=U,V,WIDTH,HEIGHT"),
         ({"camera": ("a=0",), "window": ("a=0,0,-9,9",)}, "expected MARK=U,V,WIDTH,HEIGHT"),
         ({"camera": ("a",)}, "expected MARK=DEVICE"),
+        ({"camera": ("a=/no/0", "a=/no/1")}, "--camera: mark a is given twice"),
+        ({"camera": ("a=/no/0",), "window": ("a=0,0,9,9", "a=9,0,9,9")}, "--window: mark a is given twice"),
         ({"program": "true", "window": ("a=0,0,9,9",)}, "--window is only for pictures"),
         ({"pictures": SIM.parent, "size": 0.0}, "--size 0: expected a number of pixels above 0"),
         ({"pictures": SIM.parent, "size": -5.0}, "--size -5: expected a number of pixels above 0"),

@@ -11,10 +11,10 @@ import shlex
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
+from typing import IO, TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, cast
 
 import msgspec
 from cyclopts import Parameter
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from trirail.alignment.camera_calibration import Marks
     from trirail.alignment.shapes import MarkShape
 
+T = TypeVar("T")
 Look = Callable[[], "Marks"]
 LINE = dict[str, tuple[float, float]]
 prepare(LINE)
@@ -356,15 +357,24 @@ class MarkSource:
             raise TrirailError("--window cannot be used with codes, which are identified by their numbers")
         if self.window and self.program is not None:
             raise TrirailError("--window is only for pictures: a program reports the positions of its marks itself")
-        windows = dict(map(_window, self.window))
+        windows = _by_name("--window", map(_window, self.window))
         with contextlib.ExitStack() as stack:
             if self.program is not None:
                 yield stack.enter_context(program(self.program))
             elif self.pictures is not None:
                 yield stack.enter_context(folder(self.pictures, shape, turn, windows, family))
             else:
-                devices = dict(map(_device, self.camera))
+                devices = _by_name("--camera", map(_device, self.camera))
                 yield stack.enter_context(cameras(devices, shape, turn, windows, family))
+
+
+def _by_name(option: str, pairs: Iterable[tuple[str, T]]) -> dict[str, T]:
+    named: dict[str, T] = {}
+    for name, value in pairs:
+        if name in named:
+            raise TrirailError(f"{option}: mark {name} is given twice; give each mark its own name")
+        named[name] = value
+    return named
 
 
 def _device(text: str) -> tuple[str, str]:
