@@ -86,6 +86,19 @@ def test_what_is_refused_step_by_step_leaves_nothing_wrong(
     assert len(list(tmp_path.glob("commission-demo-*.json"))) == len(list(tmp_path.glob("commission-demo-*.txt"))) == 1
 
 
+def test_values_that_the_other_keys_forbid_are_told_and_reported(
+    robot: str, typed: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path(robot).write_text(SIM.read_text(encoding="utf-8").replace("= 1e7", "= 1e6"), encoding="utf-8")
+    os.write(typed, "\n".join(["", "", *PUSH, "s"]).encode() + b"\n")
+    os.close(typed)
+    assert run(robot, "--fault", "A scale 40", "--json") == 1  # three counts are more than the in-position window
+    told = capsys.readouterr()
+    report = json.loads(told.out)
+    assert (report["changes"], report["written"]) == ({"drives.A.counts_per_metre": 25000.0}, None)
+    assert "limits.in_position.sliders[0]" in " ".join(told.err.split())
+
+
 def test_back_leads_past_steps_that_cannot_run(robot: str, typed: int, capsys: pytest.CaptureFixture[str]) -> None:
     os.write(
         typed, b"\n\n" + b"s\n" * 6 + b"b\nq\n"

@@ -23,6 +23,7 @@ from trirail.commissioning.report import ReportFile
 from trirail.commissioning.session import StepOutcome
 from trirail.commissioning.steps import Steps
 from trirail.config import Config
+from trirail.errors import ConfigError
 
 
 def merge_changes(proposals: Sequence[Changes], drives: Drives) -> tuple[dict[str, int | float], str]:
@@ -227,7 +228,8 @@ class Guide:
     def write(self, out: Path | None) -> Path | None:
         """Write the corrected configuration to `out`, or to an unused path in the folder of the original.
 
-        Return the path of the new file; None if the configuration needs no correction.
+        Return the path of the new file; None if the configuration needs no correction, or if the corrected values
+        contradict other values.
         """
         latest = self._report_file.report.latest.values()
         changes, conflict = merge_changes([entry.changes for entry in latest], self._config.drives)
@@ -236,23 +238,31 @@ class Guide:
             self._operator.show(f"Node ids: {conflict}.")
         written = None
         if changes:
-            written = out or config_edit.find_free_path(self._path)
-            text = config_edit.edit_text(files.text(self._path), changes)
-            if self._report_file.report.simulated and self._config.can.simulated.built is None:
-                text = config_edit.add_simulated_build(text, self._config.drives)
-            if written.parent.resolve() != self._path.parent.resolve():
-                text = config_edit.resolve_paths(text, self._path.parent)
-            config_edit.write_new_file(written, text)
             self._operator.show("Corrected values:")
             for key, value in changes.items():
                 self._operator.show(f"  {key} = {value:g}")
-            self._operator.show(
-                f"written to {written}; the original is unchanged. Start again with it: trirail commission {written}"
-            )
+            try:
+                written = self._write_changes(changes, out or config_edit.find_free_path(self._path))
+                self._operator.show(
+                    f"written to {written}; the original is unchanged. Start again with it: "
+                    f"trirail commission {written}"
+                )
+            except ConfigError as error:
+                self._operator.show(f"not written: {error}")
         else:
             self._operator.show("The configuration needs no correction.")
         self._report_file.conclude(changes, written)
         return written
+
+    def _write_changes(self, changes: Changes, path: Path) -> Path:
+        """Write a configuration with the changed values to `path`; return it. Raises ConfigError."""
+        text = config_edit.edit_text(files.text(self._path), changes)
+        if self._report_file.report.simulated and self._config.can.simulated.built is None:
+            text = config_edit.add_simulated_build(text, self._config.drives)
+        if path.parent.resolve() != self._path.parent.resolve():
+            text = config_edit.resolve_paths(text, self._path.parent)
+        config_edit.write_new_file(path, text)
+        return path
 
     def _run_step(self, step: GuideStep) -> bool:
         """Ask the person to run a step, skip it or return to the previous step; return False for the previous step."""
