@@ -20,6 +20,7 @@ from trirail.commissioning.coupling import (
 from trirail.commissioning.guide import merge_changes
 from trirail.commissioning.judgement import Judgement, judge_square, judge_switches, judge_watchdog
 from trirail.commissioning.moves import TEST_DISTANCE_M
+from trirail.commissioning.report import CommissioningReport, format_lines
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
 
@@ -262,3 +263,15 @@ def test_a_square_that_nobody_saw_is_wrong() -> None:
         for seen, stopped in itertools.product((True, False), ("", "slider A: following error"))
     ]
     assert verdicts == ["ok", "failed", "wrong", "failed"]
+
+
+@given(st.integers(1_000_000, 100_000_000))
+def test_the_values_of_another_drive_are_told_to_the_last_digit(counts: int) -> None:
+    """Who types what is read has the scale that was meant."""
+    given = drives()
+    given = msgspec.structs.replace(given, B=msgspec.structs.replace(given.B, counts_per_metre=float(counts)))
+    judged = judge_move(moved("B", slider="A"), given)
+    report = CommissioningReport("demo", "robot.toml", "now", False, "tests", changes=dict(judged.changes))
+    if counts != given.A.counts_per_metre:
+        assert f"drives.A.counts_per_metre = {counts}, not 1000000" in judged.remedy
+        assert f"drives.A.counts_per_metre should be {counts}" in format_lines(report)

@@ -244,7 +244,9 @@ def _propose_changes(
     different = {key: value for key, value in values.items() if value != getattr(configured, key)}
     if not different:
         return Judgement("ok", tuple(reasons))
-    lines = (f"drives.{slider}.{key} = {value:g}, not {getattr(configured, key):g}" for key, value in different.items())
+    lines = (
+        f"drives.{slider}.{key} = {value:.10g}, not {getattr(configured, key):.10g}" for key, value in different.items()
+    )
     remedy = f"in the configuration {', '.join(lines)}; then start again with it"
     changes = {f"drives.{slider}.{key}": value for key, value in different.items()}
     return Judgement("wrong", tuple(reasons), remedy, changes)

@@ -240,7 +240,7 @@ class Guide:
         if changes:
             self._operator.show("Corrected values:")
             for key, value in changes.items():
-                self._operator.show(f"  {key} = {value:g}")
+                self._operator.show(f"  {key} = {value:.10g}")
             try:
                 written = self._write_changes(changes, out or config_edit.find_free_path(self._path))
                 self._operator.show(

@@ -131,7 +131,7 @@ def format_lines(report: CommissioningReport) -> list[str]:
         if entry.remedy:
             lines.append(f"  remedy: {entry.remedy}")
     lines.append("")
-    lines += [f"{key} should be {value:g}" for key, value in report.changes.items()]
+    lines += [f"{key} should be {value:.10g}" for key, value in report.changes.items()]
     if report.written:
         lines.append(f"written to {report.written}")
     lines.append("all steps passed" if report.complete else f"not passed: {', '.join(report.incomplete)}")
