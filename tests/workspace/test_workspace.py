@@ -364,6 +364,14 @@ def test_extents_by_hand() -> None:
     assert (np.diff(found.angles) > 0.0).all()
 
 
+@given(near_robots, st.floats(-0.3, 0.3), st.floats(1e-5, 0.02))
+@settings(max_examples=20, deadline=None)
+def test_a_narrow_window_of_phi_is_found(robot: Geometry, middle: float, half: float) -> None:
+    phi = middle - half, middle + half
+    limits = msgspec.structs.replace(LIMITS, platform=msgspec.structs.replace(LIMITS.platform, phi=phi))
+    assert_allclose(measure_extent(robot, limits, permitted_slice).phi, phi, atol=1e-9)
+
+
 @pytest.mark.parametrize("robot", [PAPER, as_built(1, 0.01)])
 def test_the_volume_by_chance(robot: Geometry) -> None:
     """Poses drawn at random in a box around the window, against the joints' limits."""

@@ -98,7 +98,10 @@ def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geomet
     def slice_at(phi: float) -> Array:
         return section(geometry, limits, phi)
 
-    scan = np.linspace(*phi_range(geometry), 257)
+    low, high = phi_range(geometry)
+    # The limits of the platform may be closer together than the samples between the walls.
+    window = np.clip(np.linspace(*limits.platform.phi, 33), low, high)
+    scan = np.unique(np.concatenate([np.linspace(low, high, 257), window]))
     filled = np.flatnonzero([len(slice_at(phi)) > 0 for phi in scan])
     if len(filled) == 0:
         raise KinematicsError("no pose is within the limits: widen limits.slider, limits.platform or the margin")
