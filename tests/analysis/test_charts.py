@@ -83,3 +83,19 @@ def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path:
     assert "and 2 more" in drawn
     assert f"<!-- {name} -->" in drawn
     assert drawn.count("stroke-dasharray") > 2, "the limit that A came near, beside the period and its legend"
+
+
+@pytest.mark.generated(0, 1, 2)
+def test_no_excursion_of_a_long_curve_is_lost(seed: int) -> None:
+    """Neither the last one of the session, nor one right before a fault, since when there are no values."""
+    random = np.random.default_rng(seed)
+    number = int(random.integers(3 * charts.CURVE_BINS, 9 * charts.CURVE_BINS))
+    t, values = np.arange(number) / 1e3, np.zeros(number)
+    fault = int(random.integers(number // 2, number))
+    values[fault:] = np.nan
+    for curve in (values[:fault], values):
+        curve[fault - 1 - int(random.integers(3))] = 7.0
+        times, drawn = charts._decimate(t[: len(curve)], curve)
+        assert np.nanmax(drawn) == 7.0
+        assert (np.diff(times) >= 0.0).all()
+    assert np.isnan(drawn[times >= t[fault] + 0.02]).all()

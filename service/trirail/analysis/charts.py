@@ -251,15 +251,12 @@ def _decimate(t: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDAr
     size = len(values) // CURVE_BINS
     if size < 3:
         return t, values
-    length = len(values) // size * size
-    rows = values[:length].reshape(-1, size)
-    # argmin and argmax return the index of a NaN. A bin that contains a NaN is therefore drawn as a gap.
-    empty = np.isnan(rows).any(axis=1)
-    filled = np.where(np.isnan(rows), 0.0, rows)
-    at = np.sort(np.stack([filled.argmin(axis=1), filled.argmax(axis=1)], axis=1), axis=1)
-    thin = np.take_along_axis(rows, at, axis=1)
-    thin[empty] = np.nan
-    times = np.take_along_axis(t[:length].reshape(-1, size), at, axis=1)
+    # The last bin is filled up with its last value. A bin is drawn as a gap only if it contains nothing but NaN.
+    t, values = (np.pad(column, (0, -len(column) % size), mode="edge").reshape(-1, size) for column in (t, values))
+    empty = np.isnan(values)
+    lowest, highest = (np.where(empty, end, values) for end in (np.inf, -np.inf))
+    at = np.sort(np.stack([lowest.argmin(axis=1), highest.argmax(axis=1)], axis=1), axis=1)
+    times, thin = (np.take_along_axis(column, at, axis=1) for column in (t, values))
     return times.ravel(), thin.ravel()
 
 
