@@ -409,6 +409,17 @@ def test_what_is_wanted_is_found_and_nothing_else(found: list[Contents], wanted:
     assert [s.began for s in answer] == sorted(s.began or 0.0 for s in answer)
 
 
+@pytest.mark.parametrize("damaged", ["demo-2-part2.rrd", "demo-2-part3.rrd", "demo-2.rrd"])
+def test_a_session_with_a_file_that_cannot_be_read_keeps_its_place_and_its_robot(damaged: str) -> None:
+    """So that it is among the newest ones, where a cut of power has damaged its last file."""
+    parts = {"demo-1.rrd": 1e9, "demo-2.rrd": 2e9, "demo-2-part2.rrd": 3e9, "demo-2-part3.rrd": 4e9}
+    found = [Contents(name, "demo", began, began + 10.0, 10) for name, began in parts.items() if name != damaged]
+    found.append(Contents(damaged, "", trouble="cut off"))
+    answer = find(found)
+    assert [(session.session, session.robot) for session in answer] == [("demo-1", "demo"), ("demo-2", "demo")]
+    assert answer[1].files == [*(name for name in [*parts][1:] if name != damaged), damaged]
+
+
 @given(files())
 def test_what_stands_beside_a_recording_is_what_was_in_it(found: list[Contents]) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -90,9 +90,10 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
 def find(files: Iterable[Contents], wanted: SessionFilter = SessionFilter()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
     """Return the sessions that match a filter, in the order of their start, given the contents of all files."""
     parts_of: dict[str, list[Contents]] = {}
-    for file in sorted(files, key=lambda file: (file.began or 0.0, file.name)):
+    for file in sorted(files, key=lambda file: (file.began is None, file.began or 0.0, file.name)):
         parts_of.setdefault(file.session, []).append(file)
-    return [_joined(parts) for parts in parts_of.values() if _is_wanted(parts, wanted)]
+    sessions = [_joined(parts) for parts in parts_of.values() if _is_wanted(parts, wanted)]
+    return sorted(sessions, key=lambda session: session.began or 0.0)
 
 
 def fault_codes(files: Iterable[Contents]) -> list[str]:
