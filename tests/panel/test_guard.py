@@ -241,6 +241,34 @@ def test_a_tab_keeps_the_lease_while_it_is_open_and_no_longer(end: str) -> None:
     assert robot.commands.count("acquire") == signs
 
 
+@pytest.mark.parametrize("second", ["takeover", "acquire", "release"])
+def test_what_is_pressed_while_the_lease_is_being_taken_leaves_one_lease_to_give_back(second: str) -> None:
+    """So a takeover by a double click, during which the service may take its time to stop the robot."""
+    robot = FakeRobot()
+    with Panel(robot.robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+
+        def press(name: str) -> None:
+            what = {"do": name} if name == "takeover" else {"do": "command", "name": name}
+            opened.send(msgspec.json.encode(what).decode())
+
+        done: list[str] = []
+
+        def until_done(*names: str) -> None:
+            while not all(any(f'"done","to":"{name}"' in said for said in done) for name in names):
+                done.append(str(opened.recv(WITHIN)))
+
+        with robot.hanging("acquire"):
+            press("takeover")
+            press(second)
+            press("pause")
+            until_done("pause")
+        until_done("takeover", second)
+        if second != "release":
+            press("release")
+            until_done("release")
+        assert (robot.holder, robot.forced) == (None, [True])
+
+
 @pytest.mark.parametrize("end", ["cut off", "too large", "closed"])
 def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, caplog: pytest.LogCaptureFixture) -> None:
     before = set(threading.enumerate())

@@ -54,6 +54,8 @@ class TabRequests:
         self._reply = send
         self._pending: Counter[str] = Counter()
         self._lease: AsyncLease | None = None
+        self._acquiring = asyncio.Lock()
+        """Lock that is held while the lease is being acquired, so that the tab never holds two leases."""
         self._open = True
 
     def close(self) -> None:
@@ -116,11 +118,13 @@ class TabRequests:
     async def _command(self, name: Command, content: bytes | None) -> CommandReply | None:
         if name is Command.ACQUIRE:
             await self._acquire()
-        elif name is Command.RELEASE and self._lease is not None:
-            await self._release()
-        else:
-            return await self._robot.command(name, content)
-        return None
+            return None
+        if name is Command.RELEASE:
+            async with self._acquiring:
+                if self._lease is not None:
+                    await self._release()
+                    return None
+        return await self._robot.command(name, content)
 
     async def _follow(self, request: Follow) -> AsyncGoalHandle:
         points = await asyncio.to_thread(trajectory.parse, request.name, request.text)
@@ -128,12 +132,13 @@ class TabRequests:
 
     async def _acquire(self, *, force: bool = False) -> None:
         """Acquire the lease, and renew it until this tab closes."""
-        if self._lease is None or self._lease.lost is not None:
-            lease = self._robot.lease(force=force)
-            await lease.__aenter__()
-            self._lease = lease
-        if not self._open:
-            await self._release()
+        async with self._acquiring:
+            if self._lease is None or self._lease.lost is not None:
+                lease = self._robot.lease(force=force)
+                await lease.__aenter__()
+                self._lease = lease
+            if not self._open:
+                await self._release()
 
     async def _release(self) -> None:
         lease, self._lease = self._lease, None
