@@ -117,7 +117,7 @@ def test_a_recording_whose_file_is_taken_away_goes_on_in_another_and_says_so(how
             assert recording.lost == 0
             assert (recording.path == before) is (how == "")
             assert [words.partition(" was deleted or moved")[0] for words in told] == [
-                *([str(log_of(recording, folder))] if how == "folder" else []),
+                *([str(before.with_suffix(".log"))] if how == "folder" else []),
                 *([str(before)] if how else []),
             ]
         recording.close()
@@ -126,11 +126,6 @@ def test_a_recording_whose_file_is_taken_away_goes_on_in_another_and_says_so(how
         assert set(range(500 * last + BATCH, len(sent))) <= set(rows.tolist())
         assert recording.path.name in [name for found in find(recorded(folder)) for name in found.files]
         assert all((folder / name).exists() for found in find(recorded(folder)) for name in found.files)
-
-
-def log_of(recording: Recorder, folder: Path) -> Path:
-    """Return the log of frames: it is beside the first file."""
-    return folder / f"{recording.path.name.partition('-part')[0].removesuffix('.rrd')}.log"
 
 
 def test_a_folder_that_cannot_be_made_again_is_said_and_tried_again(tmp_path: Path) -> None:
@@ -295,6 +290,22 @@ def test_the_recorder_tidies_its_folder(tmp_path: Path) -> None:
     recording.close()
     assert parts(tmp_path) == [recording.path]
     assert told == [f"old recordings deleted, because all recordings exceed telemetry.keep_mb = 2: {old.name}"]
+
+
+def test_logs_of_frames_go_with_their_recordings(tmp_path: Path) -> None:
+    """So that they need no more room than `keep_mb` allows, however long the session is."""
+    frame = Frame(0x201).packed
+    time, config = Time(), configured(capture_can=True, rotate_minutes=0.02, keep_mb=6.0)
+    recording = recorder(tmp_path, time, config, warn=lambda _: None)
+    sent = made.records(12.0)
+    for second, records in enumerate(np.split(sent, 12)):
+        recording.frames(CAPTURED.pack(float(second), frame) * 10_000)
+        feed(recording, records, time)
+    recording.close()
+    logs = {path.stem for path in tmp_path.glob("*.log")}
+    assert logs == {path.stem for path in parts(tmp_path)}
+    assert len(logs) > 1
+    assert recording.path.with_suffix(".log").read_text().startswith("(")
 
 
 # ---------------------------------------------------------------------- disks that fail, and kills

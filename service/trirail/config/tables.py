@@ -324,7 +324,7 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     """IP address on which the metrics port listens. An address beyond the loopback requires [zenoh.tls], and readers
     then need a certificate with a role."""
     capture_can: bool = False
-    """Whether to write every CAN frame of the session to a file beside the recording, in candump's log format."""
+    """Whether to write every CAN frame to a file beside each file of the recording, in candump's log format."""
     rotate_minutes: Annotated[float, Meta(ge=0.01, le=100_000.0)] = 30.0
     """Maximum duration of one recording file [min]. The recording then continues in another file."""
     rotate_mb: Annotated[float, Meta(ge=1.0, le=1e6)] = 1000.0

@@ -76,6 +76,17 @@ class CandumpLog:
             self._file.seek(self._size)
         return f"{self._path} cannot be written: {reason}"
 
+    def turn(self, path: Path) -> None:
+        """Continue in another file. If that file cannot be created, continue in the present file."""
+        present, before = self._path, self._file
+        self._path = path
+        try:
+            self._begin("wb")
+        except OSError:
+            self._path = present
+        else:
+            before.close()
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()

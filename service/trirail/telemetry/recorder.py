@@ -46,7 +46,7 @@ MB = 1e6
 class Recorder:
     """Writer of one recording.
 
-    If telemetry.capture_can is set, the recorder also writes all CAN frames to a .log file next to the first file.
+    If telemetry.capture_can is set, the recorder also writes all CAN frames to a .log file next to each file.
 
     Parameters
     ----------
@@ -243,6 +243,8 @@ class Recorder:
         for entity, text in provenance.text_documents(self._config).items():
             stream.log(entity, rr.TextDocument(text), static=True)
         self._streams.resend_state()
+        if self._frames:
+            self._frames.turn(path.with_suffix(".log"))
         return stream
 
     def _write_sidecar(self, *, running: bool = False) -> None:
