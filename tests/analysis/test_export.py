@@ -114,6 +114,9 @@ def test_a_part_has_the_cycles_between_and_the_first_of_every_so_long(
 ) -> None:
     first, last = begin if begin is not None else -1.0, end if end is not None else 2.0
     wanted = [t for t in recording.t.tolist() if first <= t <= last]
+    said = [-0.5, *recording.t[::50].tolist(), 1.5]  # also before the first record, and after the last one
+    before, after = wanted[:1] == [recording.t[0]], wanted[-1:] == [recording.t[-1]]
+    kept = [t for t in said if t in wanted or (before and t < 0.0) or (after and t > 1.0)]
     if every is not None and wanted:
         starts = [int((t - wanted[0]) / every + 1e-6) for t in wanted]
         wanted = [t for number, t in enumerate(wanted) if not number or starts[number] > starts[number - 1]]
@@ -121,10 +124,11 @@ def test_a_part_has_the_cycles_between_and_the_first_of_every_so_long(
         with pytest.raises(ServiceError):
             recording.part(begin, end, every=every)
         return
-    part = recording.part(begin, end, every=every)
+    events = [Line(t, recording.wall[0], "INFO", "") for t in said]
+    part = recording._replace(events=events).part(begin, end, every=every)
     assert part.t.tolist() == wanted
     np.testing.assert_array_equal(part.records, recording.records[np.isin(recording.t, wanted)])
-    assert all(wanted[0] <= line.t <= wanted[-1] for line in part.events)
+    assert [line.t for line in part.events] == kept
 
 
 def test_columns_are_names_of_fields_or_words_of_these(recording: Recording) -> None:

@@ -138,17 +138,19 @@ class Recording(NamedTuple):
             words = {"of goal": goal and quoted(goal), "from": begin, "to": end}
             asked = " ".join(f"{word} {value}" for word, value in words.items() if value is not None)
             raise ServiceError(f"{self.name}: no cycles {asked}: the recording covers {t[0]:.3f} to {t[-1]:.3f} s")
+        # Events before the first or after the last record belong to the beginning or to the end of the recording.
+        earliest = t[rows[0]] if rows[0] > 0 else -math.inf
+        latest = t[rows[-1]] if rows[-1] < len(t) - 1 else math.inf
         if every is not None:
             if not every > 0.0:
                 raise ServiceError(f"the interval of the rows, {every:g} s, must be positive: use a time such as 10ms")
             number = np.floor((t[rows] - t[rows[0]]) / every + _ROUNDING)
             rows = rows[np.concatenate([[True], np.diff(number) > 0])]
-        first, last = t[rows[0]], t[rows[-1]]
         return self._replace(
             records=self.records[rows],
             t=t[rows],
             wall=self.wall[rows],
-            events=[line for line in self.events if first <= line.t <= last],
+            events=[line for line in self.events if earliest <= line.t <= latest],
         )
 
     @property
