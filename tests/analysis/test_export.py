@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import made
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 from pyarrow import csv, parquet
-from trirail.analysis import export
+from trirail.analysis import export, mcap
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
 from trirail.telemetry import recording as recordings
@@ -102,6 +103,24 @@ def test_a_file_is_never_written_over_and_its_name_says_its_format(recording: Re
     assert path.read_text() == "mine"
     with pytest.raises(ServiceError, match=r"must end in .csv, .parquet or .npy"):
         export.write(recording, tmp_path / "table.xls")
+
+
+@pytest.mark.parametrize("suffix", [*export.FORMATS, ".mcap"])
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_what_cannot_be_written_to_the_end_leaves_no_file(
+    suffix: str, error: BaseException, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    path, write = tmp_path / f"table{suffix}", mcap.write if suffix == ".mcap" else export.write
+    with monkeypatch.context() as failing:
+        failing.setitem(export._WRITERS, suffix, fail)
+        failing.setattr(mcap, "_write_bag", fail)
+        with pytest.raises((ServiceError, KeyboardInterrupt)):
+            write(recording, path)
+    assert [*tmp_path.iterdir()] == []
+    assert write(recording, path) > 0
 
 
 @given(

@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv, parquet
 
+from trirail.analysis.new_file import new_file
 from trirail.errors import ServiceError
 from trirail.telemetry.recording import Recording, table
 from trirail.wire.marks import Switch, switch_rows
@@ -70,14 +71,8 @@ def _write(path: Path, make: Callable[[], pa.Table]) -> int:
     if path.suffix not in FORMATS:
         raise ServiceError(f"{path}: the name must end in {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
     rows = make()
-    try:
-        # Mode "x" fails if the file exists, so that an earlier export is never overwritten.
-        with path.open("xb") as file:
-            _WRITERS[path.suffix](rows, file)
-    except FileExistsError as error:
-        raise ServiceError(f"{path} already exists: choose another file") from error
-    except OSError as error:
-        raise ServiceError(f"cannot write {path}: {error.strerror or error}") from error
+    with new_file(path) as file:
+        _WRITERS[path.suffix](rows, file)
     return len(rows)
 
 

@@ -17,6 +17,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from trirail import config
+from trirail.analysis.new_file import new_file
 from trirail.errors import ServiceError
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse, jacobians
@@ -64,14 +65,9 @@ def write(recording: Recording, path: Path) -> int:
     if settings is None:
         raise ServiceError(f"{recording.name}: MCAP needs the configuration, which this recording does not contain")
     geometry = config.geometry(settings.geometry)
-    try:
-        with path.open("xb"), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-") as folder:
-            count = _write_bag(Path(folder, "bag"), messages(recording, geometry))
-            Path(folder, "bag/bag.mcap").replace(path)
-    except FileExistsError as error:
-        raise ServiceError(f"{path} already exists: choose another file") from error
-    except OSError as error:
-        raise ServiceError(f"cannot write {path}: {error.strerror or error}") from error
+    with new_file(path), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-") as folder:
+        count = _write_bag(Path(folder, "bag"), messages(recording, geometry))
+        Path(folder, "bag/bag.mcap").replace(path)
     return count
 
 

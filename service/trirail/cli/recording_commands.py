@@ -167,19 +167,15 @@ def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json =
     out
         File to write; an existing file is never overwritten. If absent, standard output.
     """
+    from trirail.analysis.new_file import new_file
     from trirail.analysis.urdf import document
     from trirail.config import SIM, geometry, load
 
     settings = load(config or SIM)
     text = document(settings.robot.name, geometry(settings.geometry), settings.limits)
     if out is not None:
-        try:
-            with out.open("x", encoding="utf-8") as file:
-                file.write(text)
-        except FileExistsError as error:
-            raise ServiceError(f"{out} already exists: choose another file") from error
-        except OSError as error:
-            raise ServiceError(f"cannot write {out}: {error.strerror or error}") from error
+        with new_file(out) as file:
+            file.write(text.encode())
     if json:
         terminal.json({"file": str(out) if out else None, "urdf": text})
     elif out is not None:
