@@ -23,6 +23,7 @@ from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.contents import Contents, FaultEntry, read_contents
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.retention import sidecar
+from trirail.telemetry.rotation import claim
 from trirail.telemetry.sessions import RecordedSession, SessionFilter, find, recorded
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event, FaultDetail
@@ -130,6 +131,22 @@ def test_what_the_recorder_enters_is_what_its_files_hold(tmp_path: Path) -> None
     assert whole.cycles == 500
     assert whole.began == datetime.fromisoformat("2026-01-31 12:00:00").timestamp()
     assert whole.ended == pytest.approx(whole.began + 0.499)
+
+
+def test_a_disk_that_is_slow_at_the_start_changes_no_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    time = Time("2026-01-31 12:00:00")
+
+    def claim_slowly(folder: Path, name: str) -> Path:
+        time.ns += 3_000_000_000
+        return claim(folder, name)
+
+    monkeypatch.setattr("trirail.telemetry.recorder.claim", claim_slowly)
+    recording = Recorder(
+        configured(), tmp_path, sidecars=True, live=False, wall_ns=time.wall, monotonic_ns=time.monotonic
+    )
+    recording.records(made.records(0.1).tobytes())
+    recording.close()
+    assert contents.load(recording.path) == read_contents(recording.path)
 
 
 @pytest.mark.parametrize(

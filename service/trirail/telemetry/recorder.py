@@ -90,12 +90,13 @@ class Recorder:
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         started_ns = wall_ns()
+        self._wall_offset_ns = started_ns - monotonic_ns()
         self._config = config
         self._is_black_box = name is not None
         self._own_folder = directory if path is None and name is None else None
         session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():{STAMP}}"
         telemetry = config.telemetry
-        self._streams = streams = Streams(DrawnRobot.from_config(config), session, started_ns - monotonic_ns())
+        self._streams = streams = Streams(DrawnRobot.from_config(config), session, self._wall_offset_ns)
         self._warn = warn or (lambda text: streams.log("warning", text.text))
         server = live_server(telemetry.live_port, telemetry.live_mb) if live and telemetry.live_port else None
         try:
@@ -109,7 +110,7 @@ class Recorder:
                 f"cannot write a recording to {path or directory}: {error.strerror}; {_remedy(error)}"
             ) from error
         self._frames_cause = ""
-        self._sidecars, self._reason, self._wall_offset_ns = sidecars, reason, started_ns - monotonic_ns()
+        self._sidecars, self._reason = sidecars, reason
         self._contents: Contents | None = None
         self._sidecar_error = ""
         """Reason why the last sidecar could not be written; empty if it was written."""
