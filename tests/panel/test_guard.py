@@ -269,6 +269,24 @@ def test_what_is_pressed_while_the_lease_is_being_taken_leaves_one_lease_to_give
         assert (robot.holder, robot.forced) == (None, [True])
 
 
+def test_the_last_override_counts_however_slow_the_answers_are() -> None:
+    """So of a slider that is moved by keys: each press is a command, of which the first may be under way."""
+    robot = FakeRobot()
+    with Panel(robot.robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+
+        def until(said: str) -> None:
+            while said not in str(opened.recv(WITHIN)):
+                pass
+
+        with robot.hanging("override"):
+            for percent in (95, 90, 85):
+                opened.send(f'{{"do": "command", "name": "override", "content": {{"percent": {percent}}}}}')
+            opened.send('{"do": "command", "name": "pause"}')
+            until('"done","to":"pause"')
+        until('"override":0.85')
+        assert robot.commands == ["override", "pause", "override"]
+
+
 @pytest.mark.parametrize("end", ["cut off", "too large", "closed"])
 def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, caplog: pytest.LogCaptureFixture) -> None:
     before = set(threading.enumerate())

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections import Counter
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any, Protocol
 
 from trirail.client import trajectory
@@ -56,6 +57,8 @@ class TabRequests:
         self._lease: AsyncLease | None = None
         self._acquiring = asyncio.Lock()
         """Lock that is held while the lease is being acquired, so that the tab never holds two leases."""
+        self._overrides: list[bytes | None] = []
+        """Content of the newest command override that has not been sent; empty if all have been sent."""
         self._open = True
 
     def close(self) -> None:
@@ -67,9 +70,12 @@ class TabRequests:
     def begin(self, request: ServiceRequest) -> None:
         """Send a request in parallel with pending requests.
 
-        Ignore a command that is already pending, and a goal that refers to an outdated state.
+        Ignore a command that is already pending, and a goal that refers to an outdated state. Of the overrides that are
+        requested while another override is pending, only the newest is sent.
         """
         match request:
+            case SendCommand(Command.OVERRIDE, content):
+                self._loop.start(self._set_override(bytes(content) or None))
             case SendCommand(name, content):
                 send = lambda: self._command(name, bytes(content) or None)  # noqa: E731
                 self._loop.start(self._answer(send, name))
@@ -114,6 +120,12 @@ class TabRequests:
                 self._reply("done", to=kind, name=name, seq=seq)
         finally:
             self._pending.subtract((place, kind))
+
+    async def _set_override(self, content: bytes | None) -> None:
+        """Set the override. The operator's slider sends one for each key press."""
+        self._overrides = [content]
+        while self._overrides and not self._pending[Command.OVERRIDE]:
+            await self._answer(partial(self._command, Command.OVERRIDE, self._overrides.pop()), Command.OVERRIDE)
 
     async def _command(self, name: Command, content: bytes | None) -> CommandReply | None:
         if name is Command.ACQUIRE:
