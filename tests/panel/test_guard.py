@@ -15,14 +15,17 @@ from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
+import made
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
+from trirail.config import SIM, load
 from trirail.errors import ServiceError
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import MAX_MESSAGE, Panel, refused
+from trirail.telemetry.recorder import Recorder
 from waiting import WITHIN
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -146,6 +149,18 @@ def test_regular_files_of_the_folder_of_recordings_are_sent_and_nothing_that_lea
 
     assert sent("own.rrd").endswith(b"\r\n\r\nown")
     assert {sent(f"{name}.rrd") for name in ("link", "near", "loop", "folder", "fifo", "none")} == {b""}
+
+
+def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:
+    """Such as one beside the recordings that reads them, and has the name of a package."""
+    recorder = Recorder(load(SIM), tmp_path, live=False, sidecars=True)
+    recorder.records(made.records(0.1).tobytes())
+    recorder.close()
+    for name in ("msgspec", "csv"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit")
+    recordings = Recordings("demo", str(tmp_path))
+    (session,) = recordings.listed()["sessions"]
+    assert session.session in str(recordings.report(session.session))
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])

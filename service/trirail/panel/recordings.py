@@ -7,7 +7,6 @@ import os
 import re
 import stat
 import subprocess
-import sys
 import threading
 from http import HTTPStatus
 from pathlib import Path
@@ -18,6 +17,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 from websockets.sync.server import ServerConnection
 
+from trirail.processes.operating_system import python
 from trirail.telemetry.sessions import RecordedSession
 from trirail.wire.decoding import decoded, prepare
 
@@ -119,6 +119,6 @@ class Recordings:
         The command has a low priority, because the page may move a robot at the same time.
         """
         return subprocess.run(
-            ["nice", sys.executable, "-m", "trirail", *command], cwd=self._folder, capture_output=True,
+            ["nice", *python("-m", "trirail", *command)], cwd=self._folder, capture_output=True,
             timeout=REPORT_TIMEOUT_S, check=False, env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},
         )  # fmt: skip
