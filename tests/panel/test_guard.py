@@ -144,11 +144,26 @@ def test_regular_files_of_the_folder_of_recordings_are_sent_and_nothing_that_lea
         with browser:
             with here:
                 opened: Any = SimpleNamespace(socket=here)
-                Recordings("demo", str(folder)).send_file(opened, name, {})
+                Recordings("demo", lambda: str(folder)).send_file(opened, name, {})
             return browser.makefile("rb").read()
 
     assert sent("own.rrd").endswith(b"\r\n\r\nown")
     assert {sent(f"{name}.rrd") for name in ("link", "near", "loop", "folder", "fifo", "none")} == {b""}
+
+
+def test_the_recordings_are_those_of_the_service_that_runs_now(tmp_path: Path) -> None:
+    """It may have been started again with another folder while the panel was open."""
+    robot = FakeRobot()
+    with Panel(robot.robot(), 0) as panel:
+        robot.silent.set()
+        robot.told = msgspec.structs.replace(robot.told, recordings=str(tmp_path))
+        with panel._feed.changed:
+            assert panel._feed.changed.wait_for(lambda: panel._feed.state is None, WITHIN)
+        robot.silent.clear()
+        with panel._feed.changed:
+            assert panel._feed.changed.wait_for(lambda: panel._feed.state is not None, WITHIN)
+        listed = msgspec.json.decode(ask(panel, f"{urlsplit(panel.url).path}sessions").read())
+    assert listed == {"folder": str(tmp_path), "here": False, "sessions": []}
 
 
 def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:
@@ -158,7 +173,7 @@ def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:
     recorder.close()
     for name in ("msgspec", "csv"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit")
-    recordings = Recordings("demo", str(tmp_path))
+    recordings = Recordings("demo", lambda: str(tmp_path))
     (session,) = recordings.listed()["sessions"]
     assert session.session in str(recordings.report(session.session))
 

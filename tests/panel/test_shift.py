@@ -325,8 +325,8 @@ def test_where_there_is_nothing_here_that_is_said(page: Page, robot: FakeRobot, 
 @given(st.text())
 def test_no_other_file_is_sent(name: str) -> None:
     folder = Path(__file__).parent
-    assert Recordings("demo", str(folder)).send_file(None, name, {}) is None  # type: ignore[arg-type]
-    assert Recordings("demo", str(folder)).report(name) is None
+    assert Recordings("demo", lambda: str(folder)).send_file(None, name, {}) is None  # type: ignore[arg-type]
+    assert Recordings("demo", lambda: str(folder)).report(name) is None
 
 
 def test_a_page_without_contact_goes_nowhere(page: Page, robot: FakeRobot) -> None:

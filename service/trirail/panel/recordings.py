@@ -8,6 +8,7 @@ import re
 import stat
 import subprocess
 import threading
+from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -52,11 +53,14 @@ prepare(_SessionList)
 
 
 class Recordings:
-    """Recordings of one robot in a folder."""
+    """Recordings of one robot.
 
-    def __init__(self, robot: str, folder: str) -> None:
+    `folder` returns their folder, which another configuration of the service may change.
+    """
+
+    def __init__(self, robot: str, folder: Callable[[], str]) -> None:
         self._robot = robot
-        self._folder = Path(folder)
+        self._find_folder = folder
         self._one_report = threading.Lock()
 
     def listed(self) -> dict[str, Any]:
@@ -102,6 +106,10 @@ class Recordings:
         with self._one_report:
             done = self._run("report", *files)
         return (done.stdout or done.stderr).decode(errors="replace")
+
+    @property
+    def _folder(self) -> Path:
+        return Path(self._find_folder())
 
     @property
     def _here(self) -> bool:
