@@ -23,9 +23,11 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
+from trirail.panel import feed
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import MAX_MESSAGE, Panel, refused
 from trirail.telemetry.recorder import Recorder
+from trirail.wire.state import Info
 from waiting import WITHIN
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -164,6 +166,28 @@ def test_the_recordings_are_those_of_the_service_that_runs_now(tmp_path: Path) -
             assert panel._feed.changed.wait_for(lambda: panel._feed.state is not None, WITHIN)
         listed = msgspec.json.decode(ask(panel, f"{urlsplit(panel.url).path}sessions").read())
     assert listed == {"folder": str(tmp_path), "here": False, "sessions": []}
+
+
+def test_a_service_that_is_asked_before_it_can_answer_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that has just started publishes states, but its first answer may be late or lost."""
+    robot, asked = FakeRobot(), threading.Event()
+
+    def too_early() -> Info:
+        asked.set()
+        raise ServiceError("no answer")
+
+    monkeypatch.setattr(feed, "USERS_PERIOD_S", 0.02)
+    with Panel(robot.robot(), 0) as panel:
+        robot.silent.set()
+        with panel._feed.changed:
+            assert panel._feed.changed.wait_for(lambda: panel._feed.state is None, WITHIN)
+        robot.told = msgspec.structs.replace(robot.told, version="99.9")
+        with monkeypatch.context() as starting:
+            starting.setattr(robot, "info", too_early)
+            robot.silent.clear()
+            assert asked.wait(WITHIN)
+        with panel._feed.changed:
+            assert panel._feed.changed.wait_for(lambda: b'"version":"99.9"' in panel._feed.messages["robot"], WITHIN)
 
 
 def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from trirail.wire.vocabulary import Role
 SILENCE_S = 1.0
 """Time without a state after which the service counts as silent [s]."""
 USERS_PERIOD_S = 2.0
-"""Interval between queries of the connected users [s]."""
+"""Interval between queries of the connected users, and of a description that has not been answered [s]."""
 MAX_EVENTS = 200
 """Maximum number of events that are stored for tabs that are opened later."""
 MAX_LOOKS = 50
@@ -63,6 +63,8 @@ class Feed:
         """Events of the latest alignment, which are stored even after MAX_EVENTS later events."""
         self._alignment = ("", "")
         self._subscriptions: list[Future[object]] = []
+        self._is_described = True
+        """Whether the service has answered with its description since it was last silent."""
 
     def start(self) -> None:
         """Start the subscriptions."""
@@ -111,15 +113,19 @@ class Feed:
     async def _poll_users(self) -> None:
         while True:
             await asyncio.sleep(USERS_PERIOD_S)
+            if not self._is_described:
+                await self._describe()
             with contextlib.suppress(TrirailError):
                 self._publish("users", msgspec.json.encode({"tell": "users", "names": await self._robot.users()}))
 
     async def _describe(self) -> None:
         """Query the description of the robot again, because a service that was silent may have restarted."""
+        self._is_described = False
         poses = await self._fetch_poses()
         with contextlib.suppress(TrirailError):  # the old description remains in use until the service answers
             await self._fetch_robot()
             self._publish("poses", poses)
+            self._is_described = True
 
     async def _fetch_robot(self) -> None:
         """Query the description of the robot and the user's permissions, and publish the description to tabs.
