@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from itertools import combinations
 from pathlib import Path
 from typing import get_args
@@ -10,6 +11,8 @@ from typing import get_args
 import made
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from rich.style import Style
 from trirail.analysis import charts
 from trirail.analysis.summary import UNKNOWN_LABEL
@@ -58,6 +61,15 @@ def test_a_session_that_was_in_every_mode_is_drawn(
         assert all(f"fill: {colour}" in drawn for colour in charts.MODE_COLOURS.values())
     else:
         assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+
+
+@given(st.floats(0.0, 1e6))
+@example(179.7)
+def test_a_duration_has_no_sixtieth_second(time: float) -> None:
+    said = recording_commands._seconds(time)
+    minutes, seconds = re.fullmatch(r"(?:(\d+) min )?([\d.]+) s", said).groups()  # type: ignore[union-attr]
+    assert float(seconds) < 60.0 or minutes is None
+    assert 60.0 * int(minutes or 0) + float(seconds) == pytest.approx(time, abs=0.051 if minutes is None else 0.5)
 
 
 def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -316,5 +315,5 @@ def _each(labels: Labels, values: tuple[float, float, float], scale: float, unit
 def _seconds(time: float) -> str:
     if time < 120.0:
         return f"{time:.1f} s"
-    minutes, seconds = divmod(time, 60.0)
-    return f"{math.floor(minutes)} min {seconds:.0f} s"
+    minutes, seconds = divmod(round(time), 60)
+    return f"{minutes} min {seconds} s"
