@@ -189,6 +189,12 @@ def test_a_fault_that_never_was_is_told_with_those_that_were(
     assert capsys.readouterr().out == said
 
 
+@pytest.mark.parametrize("options", [("--since", "0001-01-01"), ("--until", "0001-01-01T00:00"), ("--last", "-1")])
+def test_what_is_no_time_and_no_number_of_sessions_is_refused(shelf: Path, options: tuple[str, str]) -> None:
+    with pytest.raises(CycloptsError, match=options[0]):
+        app(["sessions", str(shelf), *options], exit_on_error=False, print_error=False)
+
+
 @pytest.mark.parametrize("words", ["0xzzz", "0x87000000000"])
 def test_a_code_that_no_fault_can_have_is_refused(shelf: Path, words: str) -> None:
     with pytest.raises(CycloptsError, match=f"{words}' is not a code such as 0x8700"):

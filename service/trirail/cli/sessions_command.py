@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
-from cyclopts import Parameter, Token
+from cyclopts import Parameter, Token, validators
 from rich.padding import Padding
 
 from trirail.cli import terminal
@@ -30,11 +30,13 @@ FOLDER = Path("recordings")
 
 def _moment(_: Any, tokens: Sequence[Token]) -> datetime:
     try:
-        return datetime.fromisoformat(tokens[0].value)
-    except ValueError as error:
+        moment = datetime.fromisoformat(tokens[0].value)
+        moment.timestamp()  # fails in the first days of year 1
+    except (ValueError, OverflowError) as error:
         raise ValueError(
             f"{quoted(tokens[0].value)!r} is not a day or time such as 2026-01-31 or 2026-01-31T12:00:00"
         ) from error
+    return moment
 
 
 Moment = Annotated[datetime, Parameter(converter=_moment, n_tokens=1)]
@@ -51,7 +53,7 @@ def sessions(
     fault: Annotated[str | None, Parameter(validator=lambda _kind, words: _check_code(words))] = None,
     user: str | None = None,
     outcome: Outcome | None = None,
-    last: int = 20,
+    last: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 20,
     rebuild: Annotated[bool, Flag] = False,
     json: Json = False,
 ) -> int:
