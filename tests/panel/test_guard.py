@@ -153,17 +153,22 @@ def test_regular_files_of_the_folder_of_recordings_are_sent_and_nothing_that_lea
     assert {sent(f"{name}.rrd") for name in ("link", "near", "loop", "folder", "fifo", "none")} == {b""}
 
 
+def hear(panel: Panel, *, nothing: bool = False) -> None:
+    """Wait until the panel has a state of the service; with `nothing`, until the service is silent."""
+    with panel._feed.changed:
+        assert panel._feed.changed.wait_for(lambda: (panel._feed.state is None) is nothing, WITHIN)
+
+
 def test_the_recordings_are_those_of_the_service_that_runs_now(tmp_path: Path) -> None:
     """It may have been started again with another folder while the panel was open."""
     robot = FakeRobot()
     with Panel(robot.robot(), 0) as panel:
+        hear(panel)
         robot.silent.set()
         robot.told = msgspec.structs.replace(robot.told, recordings=str(tmp_path))
-        with panel._feed.changed:
-            assert panel._feed.changed.wait_for(lambda: panel._feed.state is None, WITHIN)
+        hear(panel, nothing=True)
         robot.silent.clear()
-        with panel._feed.changed:
-            assert panel._feed.changed.wait_for(lambda: panel._feed.state is not None, WITHIN)
+        hear(panel)
         listed = msgspec.json.decode(ask(panel, f"{urlsplit(panel.url).path}sessions").read())
     assert listed == {"folder": str(tmp_path), "here": False, "sessions": []}
 
@@ -178,9 +183,9 @@ def test_a_service_that_is_asked_before_it_can_answer_is_asked_again(monkeypatch
 
     monkeypatch.setattr(feed, "USERS_PERIOD_S", 0.02)
     with Panel(robot.robot(), 0) as panel:
+        hear(panel)
         robot.silent.set()
-        with panel._feed.changed:
-            assert panel._feed.changed.wait_for(lambda: panel._feed.state is None, WITHIN)
+        hear(panel, nothing=True)
         robot.told = msgspec.structs.replace(robot.told, version="99.9")
         with monkeypatch.context() as starting:
             starting.setattr(robot, "info", too_early)
