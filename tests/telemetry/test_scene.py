@@ -13,6 +13,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 from trirail.config import SIM, FramesTable, Input, LegTable, Output, load
+from trirail.errors import ServiceError
 from trirail.kinematics.geometry import Geometry, Leg
 from trirail.processes.publications import info
 from trirail.telemetry.drawn_robot import DrawnRobot
@@ -224,6 +225,16 @@ def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() ->
     told, configured = DrawnRobot.from_info(answered), DrawnRobot.from_config(CONFIG)
     assert (told.name, told.limits, told.rate_hz) == (configured.name, configured.limits, configured.rate_hz)
     assert told.geometry.legs == configured.geometry.legs
+
+
+@pytest.mark.parametrize(
+    "differs", [{"limits": {"platform": {}}}, {"geometry": ()}, {"mechanism": "stewart"}, {"frames": {"tool": 7}}]
+)
+def test_a_service_of_another_version_is_no_programming_error(differs: dict[str, Any]) -> None:
+    """Its robot cannot be drawn, in `trirail view --records` either, and that is told in one line."""
+    told = msgspec.structs.replace(info(CONFIG), **differs)
+    with pytest.raises(ServiceError, match=f"another version, {told.version}: "):
+        DrawnRobot.from_info(told)
 
 
 def test_tools_and_work_frames_are_drawn_with_their_names_as_a_service_tells_them() -> None:

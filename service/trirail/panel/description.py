@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from trirail.client.held_jog import SPEEDS
-from trirail.errors import ConfigError, ServiceError
 from trirail.panel.permissions import permissions
 from trirail.telemetry import palette
 from trirail.telemetry.drawn_robot import DrawnRobot
@@ -39,14 +37,6 @@ MILLIMETRES: dict[str, Any] = {
 
 `scale` is the number of units per metre. `decimals` applies to lengths, and `angle_decimals` to degrees. The jog steps
 `steps` are in [m], and `angle_steps` in [°]."""
-
-
-def drawn_robot(info: Info) -> DrawnRobot:
-    """Return the robot described by a service. Raises ServiceError if the service has another version."""
-    try:
-        return DrawnRobot.from_info(info)
-    except (msgspec.ValidationError, ConfigError) as error:
-        raise ServiceError(f"the service has another version, {info.version}: {error}") from error
 
 
 def describe(info: Info, robot: DrawnRobot, user: str, role: Role | None) -> dict[str, Any]:

@@ -19,8 +19,9 @@ from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import LoopThread
 from trirail.client.path_check import CheckedPath, Obstacle
 from trirail.errors import TrirailError
-from trirail.panel.description import describe, drawn_robot
+from trirail.panel.description import describe
 from trirail.panel.permissions import permissions
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.goals import PoseGoal
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.vocabulary import Role
@@ -133,7 +134,7 @@ class Feed:
         Raises ServiceError if the service has another version.
         """
         info, role = await self._robot.info(), await self._robot.role()
-        robot = drawn_robot(info)
+        robot = DrawnRobot.from_info(info)
         about = msgspec.json.encode(describe(info, robot, self._robot.user, role))
         self._robot_drawing = robot
         self.recordings = info.recordings

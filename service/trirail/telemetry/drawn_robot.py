@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.interface import NAMES
@@ -12,6 +13,7 @@ from trirail_drivers.interface import NAMES
 from trirail import config
 from trirail.config import Config, FramesTable, Limits
 from trirail.config.tables import GeometryTable
+from trirail.errors import ConfigError, ServiceError
 from trirail.kinematics.geometry import Geometry
 from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import Info
@@ -72,8 +74,15 @@ class DrawnRobot:
     def from_info(cls, info: Info) -> DrawnRobot:
         """Return the data of a service's robot, given the description that the service sends.
 
-        Raises msgspec.ValidationError or ConfigError if the service runs an incompatible version.
+        Raises ServiceError if the service has another version, whose description cannot be used.
         """
+        try:
+            return cls._described(info)
+        except (msgspec.ValidationError, ConfigError) as error:
+            raise ServiceError(f"the service has another version, {info.version}: {error}") from error
+
+    @classmethod
+    def _described(cls, info: Info) -> DrawnRobot:
         each = [_leg(leg) for leg in info.geometry]
         legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)
         limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)
