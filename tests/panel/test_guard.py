@@ -195,6 +195,24 @@ def test_a_service_that_is_asked_before_it_can_answer_is_asked_again(monkeypatch
             assert panel._feed.changed.wait_for(lambda: b'"version":"99.9"' in panel._feed.messages["robot"], WITHIN)
 
 
+def test_named_poses_stay_where_a_question_for_them_is_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, asked = FakeRobot(), threading.Event()
+
+    def no_answer() -> None:
+        asked.set()
+        raise ServiceError("no answer")
+
+    with Panel(robot.robot(), 0) as panel:
+        hear(panel)
+        monkeypatch.setattr(robot, "poses", no_answer)
+        robot.teach("pick")
+        robot.say("the last event")
+        assert asked.wait(WITHIN)
+        with panel._feed.changed:
+            assert panel._feed.changed.wait_for(lambda: b"the last event" in panel._feed.events(0)[-1][1], WITHIN)
+            assert msgspec.json.decode(panel._feed.messages["poses"])["names"] == ["park"]
+
+
 def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:
     """Such as one beside the recordings that reads them, and has the name of a package."""
     recorder = Recorder(load(SIM), tmp_path, live=False, sidecars=True)

@@ -144,10 +144,13 @@ class Feed:
         self._publish("robot", about)
 
     async def _fetch_poses(self) -> bytes:
+        """Query the named poses; return the message about them, or the last such message if there is no answer."""
         try:
             poses = await self._robot.poses()
         except TrirailError:
-            poses = {}  # the service has no named poses
+            if "poses" in self.messages:
+                return self.messages["poses"]
+            poses = {}
         taught = [name for name, pose in poses.items() if pose.taught]
         return msgspec.json.encode({"tell": "poses", "names": list(poses), "taught": taught})
 
