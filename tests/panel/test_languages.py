@@ -18,6 +18,7 @@ from trirail.errors import RefusalCode
 from trirail.panel.server import LANGUAGES, Panel
 from trirail.wire.messages import Outcome
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Role
+from waiting import wait_until
 
 PAGE = Path(str(trirail.__file__)).parent / "panel/page"
 FILES = {file.stem: msgspec.json.decode(file.read_bytes(), type=dict[str, str]) for file in PAGE.glob("*.json")}
@@ -216,3 +217,21 @@ def test_the_language_is_the_browser_s_or_that_of_the_switch_and_keeps_the_lease
         assert again.text("[data-command=enable]") == shown["en"]
         again.evaluate("localStorage.clear()")
         again.close()
+
+
+@pytest.mark.viewer
+@needs_chromium
+def test_a_browser_that_keeps_nothing_shows_the_page_and_stops(browser: Page, robot: FakeRobot) -> None:
+    """It may be set to refuse cookies and all else of pages; what asks for that then fails."""
+    with Panel(robot.robot(), 0) as panel:
+        refusal = b"{get() { throw new DOMException('refused', 'SecurityError'); }}"
+        refused = b"Object.defineProperty(self, 'localStorage', %s);" % refusal
+        panel._files["words.js"] = refused + panel._files["words.js"]
+        page = browser.another()
+        page.open(panel.url)
+        page.until(SHOWN)
+        page.choose("#language", "de")
+        page.until("document.querySelector('[data-command=enable]').innerText === 'Ein'")
+        page.click("#stop")
+        wait_until(lambda: robot.commands == ["stop"])
+        page.close()

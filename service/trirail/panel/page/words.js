@@ -48,6 +48,15 @@ async function fetched(name) {
   }
 }
 
+// Where the browser keeps the choice; null where it keeps nothing for this page, and refuses the question.
+function stored() {
+  try {
+    return localStorage;
+  } catch {
+    return null; // the page works, and STOP with it
+  }
+}
+
 async function show(code) {
   words = await fetched(`${code}.json`);
   document.documentElement.lang = language = code;
@@ -60,12 +69,12 @@ async function show(code) {
 }
 
 const languages = await fetched("languages.json");
-const wished = [localStorage.getItem(KEPT), ...navigator.languages.map((each) => each.split("-")[0]), "en"];
+const wished = [stored()?.getItem(KEPT), ...navigator.languages.map((each) => each.split("-")[0]), "en"];
 const chosen = wished.find((each) => each in languages) ?? "en";
 const choice = document.getElementById("language");
 for (const [code, name] of Object.entries(languages)) choice.add(new Option(name, code, false, code === chosen));
 choice.addEventListener("change", () => {
-  localStorage.setItem(KEPT, choice.value);
   show(choice.value);
+  stored()?.setItem(KEPT, choice.value);
 });
 await show(chosen);
