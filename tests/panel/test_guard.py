@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
 import made
 import msgspec
@@ -223,6 +223,20 @@ def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:
     recordings = Recordings("demo", lambda: str(tmp_path))
     (session,) = recordings.listed()["sessions"]
     assert session.session in str(recordings.report(session.session))
+
+
+@pytest.mark.parametrize("name", ["best run.rrd", "Prüfung (2).rrd", 'a"b\r\nc.rrd', "%41.rrd", ".rrd"])
+def test_a_recording_is_sent_whatever_its_user_has_called_it(name: str, tmp_path: Path) -> None:
+    """It is in the list, as `trirail sessions` has it."""
+    (tmp_path / name).write_bytes(b"own")
+    robot = FakeRobot()
+    robot.told = msgspec.structs.replace(robot.told, recordings=str(tmp_path))
+    with Panel(robot.robot(), 0) as panel:
+        sent = ask(panel, f"{urlsplit(panel.url).path}recording/{quote(name, safe='')}")
+        assert (sent.status, sent.read()) == (200, b"own")
+        disposition = str(sent.headers["Content-Disposition"])
+        assert unquote(disposition.removeprefix("attachment; filename*=UTF-8''")) == name
+        assert ask(panel, f"{urlsplit(panel.url).path}recording/..%2F{tmp_path.name}%2F{quote(name)}").status == 404
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])

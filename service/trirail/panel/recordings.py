@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import stat
 import subprocess
 import threading
@@ -12,6 +11,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import msgspec
 from websockets.datastructures import Headers
@@ -24,8 +24,6 @@ from trirail.wire.decoding import decoded, prepare
 
 MAX_SESSIONS = 100
 """Maximum number of sessions in the list, which contains the newest sessions."""
-RECORDING_NAME = re.compile(r"[\w.-]+\.rrd", re.ASCII)
-"""Pattern of the names of recordings, which are safe in an HTTP header."""
 REPORT_TIMEOUT_S = 300.0
 """Time limit for a report, and for reading the recordings for the list [s]."""
 
@@ -76,18 +74,18 @@ class Recordings:
 
         Return None, without sending anything, if the recording is not a regular file in the folder.
         """
-        if not self._here or RECORDING_NAME.fullmatch(name) is None:
+        if not self._here or "/" in name or not name.endswith(".rrd"):
             return None
         try:
             file = open(self._folder / name, "rb", opener=_open_here)  # noqa: SIM115
-        except OSError:
+        except (OSError, ValueError):  # ValueError: the name contains a null character
             return None
         with file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 return None
             size = os.fstat(file.fileno()).st_size
             own = {"Content-Type": "application/octet-stream", "Content-Length": str(size), "Connection": "close",
-                   "Content-Disposition": f'attachment; filename="{name}"'}  # fmt: skip
+                   "Content-Disposition": f"attachment; filename*=UTF-8''{quote(name, safe='')}"}  # fmt: skip
             status = HTTPStatus.OK
             with contextlib.suppress(OSError):  # the browser has disconnected
                 opened.socket.sendall(Response(status.value, status.phrase, Headers(own | headers)).serialize())

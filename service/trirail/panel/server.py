@@ -164,7 +164,7 @@ class Panel:
         if name == SESSIONS:
             return _response(HTTPStatus.OK, msgspec.json.encode(self._recordings.listed()), "json")
         folder, _, rest = name.partition("/")
-        if folder == RECORDING and (sent := self._recordings.send_file(opened, rest, HEADERS)):
+        if folder == RECORDING and (sent := self._recordings.send_file(opened, unquote(rest), HEADERS)):
             return sent
         if folder == REPORT and (words := self._recordings.report(unquote(rest))):
             return _response(HTTPStatus.OK, words.encode(), "txt")
