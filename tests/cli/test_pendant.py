@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import select
+import threading
+import tty
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
+from trirail.cli import pendant
 from trirail.cli.pendant import KEY_TIMEOUT_S, Pendant, keys
 from trirail.client import held_jog
 from waiting import wait_until
@@ -34,6 +41,40 @@ def test_keys(typed: bytes, found: list[str]) -> None:
 @given(st.binary())
 def test_whatever_is_typed_is_keys(typed: bytes) -> None:
     assert all(keys(typed))
+
+
+@pytest.mark.parametrize(
+    ("typed", "found"),
+    [
+        (b"\x1b[D\x1b[A", ["left", "up"]),
+        (b"\x1bOC", ["right"]),
+        (b"\x1b[1;2B\x1b[3~a", ["down", "a"]),
+        (b"\x1bd\x1b", ["escape", "d", "escape"]),
+    ],
+)
+def test_a_key_that_a_serial_line_sends_byte_by_byte_is_the_same_key(
+    typed: bytes, found: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyboard, terminal = pty.openpty()
+    tty.setcbreak(terminal)
+    monkeypatch.setattr(pendant, "sys", SimpleNamespace(stdin=SimpleNamespace(fileno=lambda: terminal)))
+    pressed: list[str] = []
+    hand = SimpleNamespace(over=False, press=lambda key, _: pressed.append(key), tick=lambda _: None)
+    hand.speed, hand.said = TOP, ""
+    shown = SimpleNamespace(update=lambda *_, **__: None)
+    serving = threading.Thread(target=pendant._serve, args=(hand, SimpleNamespace(state=None), shown))
+    serving.start()
+    try:
+        for byte in typed:
+            os.write(keyboard, bytes([byte]))
+            wait_until(lambda: not select.select([terminal], [], [], 0.0)[0])
+        wait_until(lambda: len(pressed) >= len(found))
+    finally:
+        hand.over = True
+        serving.join()
+        os.close(keyboard)
+        os.close(terminal)
+    assert pressed == found
 
 
 class Operator:

@@ -35,6 +35,14 @@ _ARROWS = {"A": "up", "B": "down", "C": "right", "D": "left"}
 # An arrow key is sent as ESC [ A, in application mode as ESC O A, and with modifiers as ESC [ 1 ; 2 A.
 _KEY = re.compile(r"\x1b[\[O](?P<parameters>[0-9;]*)(?P<final>[@-~])|(?P<escape>\x1b)|(?P<character>.)", re.DOTALL)
 
+_BEGUN = re.compile(rb"\x1b([\[O][0-9;]*)?\Z")
+
+
+def split(typed: bytes) -> tuple[bytes, bytes]:
+    """Split the input into complete keys and an escape sequence at its end that is incomplete, as on a serial line."""
+    begun = _BEGUN.search(typed)
+    return (typed[: begun.start()], begun[0]) if begun is not None else (typed, b"")
+
 
 def keys(typed: bytes) -> Iterator[str]:
     """Yield the keys in the input: up, down, left, right, escape, or a character in lower case; = counts as +.
@@ -186,16 +194,20 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
 def _serve(pendant: Pendant, newest: _StateReader, live: Live) -> None:
     descriptor = sys.stdin.fileno()
     drawn, last = -math.inf, time.monotonic()
+    begun = b""
     while not pendant.over:
         ready, _, _ = select.select([descriptor], [], [], KEY_TIMEOUT_S / 5.0)
         now = time.monotonic()
         if now - last > STALL_S:  # stopped and continued: the buffered keys are stale
             pendant.release_key()
             termios.tcflush(descriptor, termios.TCIFLUSH)
-        elif descriptor in ready:
-            typed = os.read(descriptor, 1024)
-            if not typed:
-                return  # the terminal is gone
+            begun = b""
+        else:
+            typed, begun = begun, b""  # if nothing follows, this is the key Escape
+            if descriptor in ready:
+                if not (more := os.read(descriptor, 1024)):
+                    return  # the terminal is gone
+                typed, begun = split(typed + more)
             for key in keys(typed):
                 pendant.press(key, now)
         pendant.tick(now)
