@@ -138,6 +138,23 @@ def test_ctrl_c_while_a_goal_is_sent_stops_it_if_it_was_taken(robot: Robot, slow
     kept.clear()
 
 
+def test_ctrl_c_on_the_way_to_the_first_point_of_a_path_stops_the_robot(robot: Robot, slow: Slow) -> None:
+    ids: list[str] = []
+
+    def accept() -> None:
+        way = slow.next()
+        assert way.payload is not None
+        ids.append(msgspec.json.decode(way.payload.to_bytes())["id"])
+        reply(way, GoalReply(ids[0], 10.0))
+        wait_until(lambda: bool(robot._robot._goals._accepted))
+
+    interrupt(lambda: robot.follow([(0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 0.0, 0.0)], go_there=True), accept)
+    with slow.next() as stop:
+        assert stop.payload is not None
+        assert str(stop.key_expr) == "trirail/demo/cmd/ann/stop"
+        assert msgspec.json.decode(stop.payload.to_bytes()) == {"goal": ids[0]}
+
+
 def test_ctrl_c_ends_a_command_and_the_next_one_is_answered(robot: Robot, slow: Slow) -> None:
     kept: list[zenoh.Query] = []
     interrupt(robot.home, lambda: kept.append(slow.next()))

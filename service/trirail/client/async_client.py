@@ -303,7 +303,12 @@ class AsyncRobot:
         """Send a timed trajectory that begins at the robot's pose; see trirail.client.client.Robot.follow."""
         trajectory = points_of(points)
         if go_there:
-            check_arrived(await (await self.send(first_pose(trajectory))).wait())
+            way = await self.send(first_pose(trajectory))
+            try:
+                check_arrived(await way.wait())
+            except asyncio.CancelledError:
+                self._stop_unanswered(way.id)
+                raise
         return await self.send(
             lambda name: TrajectoryGoal(
                 trajectory, stretch=stretch, settle=settle, id=name, marks=marks_of(marks), stop_at=stop_at_of(stop_at)
@@ -357,12 +362,16 @@ class AsyncRobot:
         except BaseException as error:
             # If a jog's renewal is cancelled, the jog itself continues until its time-out.
             if self._goals.refuse(goal_id) and isinstance(error, asyncio.CancelledError):
-                with contextlib.suppress(ServiceError):  # the connection is closed
-                    stop = msgspec.json.encode(Stop(goal_id))
-                    self._connection.query_unanswered(("cmd", self.user, Command.STOP), stop)
+                self._stop_unanswered(goal_id)
             raise
         self._goals.accept(goal, reply)
         return goal
+
+    def _stop_unanswered(self, goal_id: str) -> None:
+        """Stop a goal whose sender was cancelled, without waiting for a reply."""
+        with contextlib.suppress(ServiceError):  # the connection is closed
+            stop = msgspec.json.encode(Stop(goal_id))
+            self._connection.query_unanswered(("cmd", self.user, Command.STOP), stop)
 
     async def check(self, goal: Goal) -> GoalReply:
         """Plan a trirail.wire.goals.Goal without moving; return the reply that the service would give to the goal now.
