@@ -443,7 +443,7 @@ class Interrupted:
 
     def states(self, timeout: float) -> Iterator[SimpleNamespace]:
         while True:
-            yield SimpleNamespace(goal=None)
+            yield SimpleNamespace(goal=None, seq=1)
             if self.cancelled.is_set() or self._left == 2:
                 self._press()
             elif self._left == 1:
@@ -466,6 +466,14 @@ def test_a_second_ctrl_c_leaves_and_says_that_the_goal_goes_on() -> None:
     with pytest.raises(ServiceError, match="goal g-1 may still be running"):
         terminal.follow(goal, goal, "away", show=False)
     assert goal.cancelled.wait(60.0)
+
+
+def test_a_goal_of_a_service_that_has_restarted_is_waited_for_no_longer() -> None:
+    states = (SimpleNamespace(goal=None, seq=seq) for seq in (900, 920, 20, 40))
+    robot: Any = SimpleNamespace(name="demo", states=lambda _: states)
+    goal: Any = SimpleNamespace(id="g-1", reply=GoalReply("g-1", 1.0), result=None)
+    with pytest.raises(ServiceError, match="the service has restarted: the end of goal g-1 is unknown"):
+        terminal.follow(robot, goal, "away", show=False)
 
 
 def test_ctrl_c_while_a_command_is_loaded_ends_it_without_a_word() -> None:

@@ -163,9 +163,13 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
         task = progress.add_task(plain(title) + notes(goal.reply), total=1.0, left="")
 
         def wait_for_end() -> Result:
+            cycle = 0
             for state in robot.states(SERVICE_TIMEOUT_S):
                 if goal.result is not None:
                     return goal.result
+                if state.seq < cycle:
+                    raise ServiceError(f"the service has restarted: the end of goal {goal.id} is unknown")
+                cycle = state.seq
                 if state.goal is not None and state.goal.id == goal.id:
                     progress.update(task, completed=state.goal.progress, left=left(state, state.goal))
             if goal.result is not None:
