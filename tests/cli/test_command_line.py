@@ -195,6 +195,7 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
             f"no service at {NOBODY}: connection refused; start trirail run or zenohd there"
             ", or name another address with --connect (in Python connect=)",
         ),
+        ("stop --connect tcp/127.0.0.1", 1, "the port is missing: an endpoint is protocol/address"),
         ("stop --connect tcp/no..name:1", 1, "invalid host name; start trirail run or zenohd there"),
     ],
 )
