@@ -204,6 +204,15 @@ def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code:
     assert said in run(*line.split())[2]
 
 
+@pytest.mark.parametrize("command", ["stop", "status", "fleet", "view --web"])
+def test_a_folder_of_the_environment_is_for_certificates_alone(
+    command: str, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("TRIRAIL_TLS", str(tmp_path / "keys"))
+    assert f"no service at {NOBODY}" in run(*command.split(), "--connect", NOBODY)[2]
+    assert f"{tmp_path}/keys/ca.pem" in run(*command.split(), "--connect", "tls/127.0.0.1:1")[2]
+
+
 class Slow:
     """A robot that takes what it is sent, and so many times slower."""
 

@@ -87,8 +87,9 @@ class Address:
 
     connect: Annotated[str, Parameter(env_var="TRIRAIL_CONNECT")] = DEFAULT_LOCATOR
     "Zenoh locator of the service or of a router."
-    tls: Annotated[Path | None, Parameter(env_var="TRIRAIL_TLS")] = None
-    "Folder with ca.pem, cert.pem and key.pem, for a locator tls/HOST:PORT. If absent, ~/.config/trirail/ROBOT."
+    tls: Path | None = None
+    """Folder with ca.pem, cert.pem and key.pem, for a locator tls/HOST:PORT. If absent, that of TRIRAIL_TLS, or
+    ~/.config/trirail/ROBOT."""
     json: Json = False
 
 

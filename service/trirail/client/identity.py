@@ -9,7 +9,7 @@ from pathlib import Path
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.credentials import Credentials, credentials_for
-from trirail.wire.endpoints import DEFAULT_LOCATOR, ReachableBy, reach
+from trirail.wire.endpoints import DEFAULT_LOCATOR
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.text import check_name, quoted
 
@@ -19,13 +19,11 @@ def identity(
 ) -> tuple[str, str, str, Credentials | None]:
     """Return the robot's name, the locator, the user's name and the credentials of a client.
 
-    Missing arguments are replaced by TRIRAIL_ROBOT, TRIRAIL_CONNECT, the login name and TRIRAIL_TLS. Raises
-    RefusedError if a name is invalid or is not the certificate's name, and ServiceError for invalid credentials.
+    Missing arguments are replaced by TRIRAIL_ROBOT, TRIRAIL_CONNECT and the login name. Raises RefusedError if a name
+    is invalid or is not the certificate's name, and ServiceError for invalid credentials.
     """
     robot = check_name(robot or os.environ.get("TRIRAIL_ROBOT") or "demo", "robot")
     connect = connect or os.environ.get("TRIRAIL_CONNECT") or DEFAULT_LOCATOR
-    if tls is None and reach(connect) is ReachableBy.CERTIFICATE:
-        tls = os.environ.get("TRIRAIL_TLS") or None
     credentials = credentials_for(robot, connect, tls)
     known_as = credentials.name if credentials is not None else ""
     name = check_name(user or known_as or _user(), "user")

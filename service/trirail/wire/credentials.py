@@ -157,12 +157,12 @@ def with_role(users: Mapping[str, Role], folder: Path) -> dict[str, Role]:
 def credentials_for(robot: str, locator: str, folder: Path | str | None = None) -> Credentials | None:
     """Return the credentials that a client needs at a locator; None if the locator requires no credentials.
 
-    The default folder is ~/.config/trirail/<robot>. Raises ServiceError if the credentials are unusable, or if a folder
-    is given although the locator's protocol does not use credentials.
+    The default folder is that of TRIRAIL_TLS, or else ~/.config/trirail/<robot>. Raises ServiceError if the credentials
+    are unusable, or if a folder is given although the locator's protocol does not use credentials.
     """
     if reach(locator) is ReachableBy.CERTIFICATE:
         base = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-        return Credentials.read(Path(folder) if folder is not None else base / "trirail" / robot)
+        return Credentials.read(Path(folder or os.environ.get("TRIRAIL_TLS") or base / "trirail" / robot))
     if folder is not None:
         raise ServiceError(f"{locator}: this protocol does not use credentials; connect to tls/HOST:PORT")
     return None
