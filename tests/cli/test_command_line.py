@@ -261,6 +261,26 @@ def test_what_is_slowed_is_said_beside_its_end_and_with_json_a_field(
     assert run(*line.split())[2] == ""
 
 
+class Unanswered(Slow):
+    """A robot whose answer to a jog does not come before Ctrl-C."""
+
+    def __init__(self) -> None:
+        super().__init__(1.0)
+        self.reply = self.result = None  # type: ignore[assignment]
+        self.opened = False
+
+    def __enter__(self) -> Slow:
+        if self.opened:
+            raise KeyboardInterrupt
+        self.opened = True
+        return self
+
+
+def test_ctrl_c_before_a_jog_is_accepted_is_a_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "Robot", lambda *_, **__: Unanswered())
+    assert run("jog", "0.01", "0", "0") == (1, "the jog has no known end\n", "")
+
+
 WRONG = ["report", "replay", "goto", "goto 1 2", "nothing", "watch extra", "status --wat", "config wat"]
 
 

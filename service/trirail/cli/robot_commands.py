@@ -212,17 +212,14 @@ def jog(
     if vy is None or w is None:
         raise CycloptsError(msg="jog takes VX, VY and W, or none of them: then keys move the robot while they are held")
     with service.open() as robot:
-        try:
-            with robot.jog(x=vx, y=vy, phi=w, tool=tool) as jogging:
-                reply = jogging.reply
-                if not service.json and reply is not None and (words := terminal.slowed(reply)):
-                    terminal.print_error(words)
-                live.show_jog(robot, jogging, seconds, show=not service.json)
-        except KeyboardInterrupt:
-            pass
+        jogging = robot.jog(x=vx, y=vy, phi=w, tool=tool)
+        with contextlib.suppress(KeyboardInterrupt), jogging:
+            if not service.json and jogging.reply is not None and (words := terminal.slowed(jogging.reply)):
+                terminal.print_error(words)
+            live.show_jog(robot, jogging, seconds, show=not service.json)
         if jogging.error is not None:
             raise jogging.error
-        result = jogging.result
+        reply, result = jogging.reply, jogging.result
     slowed = {"slowed": reply.slowed} if reply else {}
     show(service, (result._asdict() if result else {}) | slowed, result.message if result else NO_END)
     return 0 if result and result.outcome == "done" else 1
