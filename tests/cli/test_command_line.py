@@ -281,6 +281,13 @@ def test_ctrl_c_before_a_jog_is_accepted_is_a_line(run: Run, monkeypatch: pytest
     assert run("jog", "0.01", "0", "0") == (1, "the jog has no known end\n", "")
 
 
+def test_what_is_not_utf_8_is_refused_in_a_line(run: Run) -> None:
+    not_utf_8 = os.fsdecode(b"\xff")
+    assert "not a goal" in run("goal", f'{{"kind": "{not_utf_8}"}}', "--connect", NOBODY)[2]
+    message = json.loads(run("follow", f"{not_utf_8}.csv", "--json")[1])["message"]
+    assert message.startswith(f"{not_utf_8}.csv: No such file")
+
+
 WRONG = ["report", "replay", "goto", "goto 1 2", "nothing", "watch extra", "status --wat", "config wat"]
 
 

@@ -145,7 +145,7 @@ def goal(content: str, /, *, wait: Wait = False, service: Service = HERE) -> int
     content
         Kind and fields of the goal as in messages, in SI units and radians.
     """
-    request: Goal = boundary.decode(content.encode(), Goal, "not a goal")
+    request: Goal = boundary.decode(content.encode(errors="surrogateescape"), Goal, "not a goal")
     with service.open() as robot:
         return _follow(service, robot, robot.send(request), wait, str(request.__struct_config__.tag))
 

@@ -6,6 +6,7 @@ import contextlib
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,7 +74,11 @@ def print_error(words: str) -> None:
 
 def json(content: object) -> None:
     """Print one JSON object on its own line, and flush the output."""
-    sys.stdout.write(json_printable(msgspec.json.encode(content).decode()) + "\n")
+    try:
+        line = msgspec.json.encode(content).decode()
+    except UnicodeEncodeError:  # the name of a file need not be UTF-8
+        line = dumps(msgspec.to_builtins(content))
+    sys.stdout.write(json_printable(line) + "\n")
     sys.stdout.flush()
 
 
