@@ -141,6 +141,15 @@ def test_whatever_ends_it_is_told_once_it_has_looked(looks: int, error: BaseExce
     assert all(look.words == (str(error) or "KeyboardInterrupt") for look in told.looks[looks:])
 
 
+@pytest.mark.parametrize("looks", [0, 1, 3])
+def test_a_look_without_more_pictures_is_an_error_and_no_result(looks: int) -> None:
+    told = Told(3)
+    pictures = [told.stage.look()] * looks
+    with pytest.raises(RuntimeError, match="no more pictures"):
+        told.drive(calibrate_by_moves(), iter(pictures).__next__)
+    assert [look.end for look in told.looks] == [None] * looks + ["failed"] * (looks > 0)
+
+
 def test_a_service_that_takes_nothing_is_warned_of_once_and_the_result_is_the_same() -> None:
     told = Told(4)
     wanted = task(told, (1e-4, -2e-4, 1e-3))

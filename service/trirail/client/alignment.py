@@ -144,7 +144,7 @@ async def drive_async(
                     await completed(sleep(wait))
                     marks = sight.marks
                 else:
-                    marks = await completed(look())
+                    marks = await _marks_from(look)
                 state = await completed(robot.state())
                 sight = Observation(marks, state.pose, time.monotonic(), state.sliders.position)
             request = requests.send(sight)
@@ -153,6 +153,15 @@ async def drive_async(
     except BaseException as error:
         await _report(robot, reports, reports.failure(error))
         raise
+
+
+async def _marks_from(look: Look) -> Marks:
+    """Call `look`. Raises RuntimeError for a StopIteration, which would count as the end of the procedure."""
+    try:
+        marks: Marks = await completed(look())
+    except StopIteration as error:
+        raise RuntimeError("look raised StopIteration: it has no more pictures") from error
+    return marks
 
 
 async def completed(called: Any) -> Any:
