@@ -147,6 +147,9 @@ CALLS: dict[str, Call] = {
     "move_sliders": lambda robot, n: robot.move_sliders(n, n, n, speed=n, valid_for=n),
     "follow": lambda robot, n: robot.follow([TrajectoryPoint(0.0, n, n, n), TrajectoryPoint(n, n, n, n, (n, n, n))]),
     "follow, rows": lambda robot, n: robot.follow([(0.0, n, n, n), [n, n, n, n]]),
+    "marks": lambda robot, n: robot.move(
+        marks=[{"output": "lamp", "after_start": n}, {"output": "lamp", "at": {"phi": n}, "pulse_width": n}]
+    ),
     "jog": lambda robot, n: robot.jog(n, n, n, timeout=n, tool=(n, n)),
     "track": lambda robot, n: robot.track(timeout=n),
     "check": lambda robot, n: robot.check(PoseGoal(n, n, n, speed=n, limits=limits(n), valid_for=n)),

@@ -6,10 +6,7 @@ numbers of numpy and fractions; booleans and strings are not numbers.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import operator
-import sys
 import threading
 import uuid
 from collections.abc import Callable
@@ -23,6 +20,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
 from trirail.wire.goals import Goal, PathGoal, TrajectoryGoal
 from trirail.wire.kinds.trajectory import parts
+from trirail.wire.plain_values import finite, plain_value
 from trirail.wire.sizes import MAX_POINTS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command, CommandContent
@@ -107,9 +105,9 @@ def number(value: object, what: str) -> float:
     Raises RefusedError if the value is not a finite number; the error message calls the value `what`.
     """
     try:
-        plain = value if isinstance(value, bool) else _plain(value)
+        plain = value if isinstance(value, bool) else plain_value(value)
         if isinstance(plain, (int, float)) and not isinstance(plain, bool):
-            return _finite(float(plain))
+            return finite(float(plain))
     except (TypeError, ValueError, ArithmeticError):
         pass
     raise RefusedError(RefusalCode.MALFORMED, f"{what} is {quoted(repr(value))}: expected a finite number")
@@ -130,29 +128,4 @@ def seconds(value: object) -> float | None:
     return wait if wait < threading.TIMEOUT_MAX else None
 
 
-def _plain(value: Any) -> Any:
-    """Convert a value to a type that messages can contain.
-
-    Raises TypeError if the value cannot be converted, and ValueError if it is not finite.
-    """
-    numpy = sys.modules.get("numpy")  # a program that uses numpy's numbers has already imported numpy
-    if numpy is not None and isinstance(value, (numpy.ndarray, numpy.generic)):
-        if value.dtype.kind == "f" and not numpy.isfinite(value).all():
-            raise ValueError(f"{value!r} is not finite")
-        value = value.tolist()  # numbers, booleans and strings of Python
-        if isinstance(value, list | str | bool):
-            return value
-    for name, convert in (("__index__", operator.index), ("__float__", float)):
-        if hasattr(type(value), name):  # float() alone would also accept strings
-            with contextlib.suppress(TypeError):
-                return _finite(convert(value))
-    raise TypeError(f"{value!r}, of type {type(value).__name__}, is no number")
-
-
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError(f"{value} is no finite number")
-    return value
-
-
-_ENCODER = msgspec.json.Encoder(enc_hook=_plain, decimal_format="number")
+_ENCODER = msgspec.json.Encoder(enc_hook=plain_value, decimal_format="number")

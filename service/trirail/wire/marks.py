@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from typing import Annotated, Any, Literal
 
+import msgspec
 from msgspec import Meta, Struct
 from trirail_drivers.interface import Triple
 
 from trirail.wire.decoding import converted, prepare
+from trirail.wire.plain_values import plain_value
 from trirail.wire.sizes import MAX_NAME
 
 Length = Annotated[float, Meta(ge=0.0, le=1e3)]
@@ -101,8 +104,15 @@ MarkLike = Mark | Mapping[str, Any]
 
 
 def marks_of(marks: Sequence[MarkLike]) -> tuple[Mark, ...]:
-    """Convert mappings to marks; marks are returned unchanged. Raises ValueError if a mapping is invalid."""
-    return tuple(mark if isinstance(mark, Mark) else converted(dict(mark), Mark) for mark in marks)
+    """Convert mappings, with numbers of any library, to marks; marks are returned unchanged.
+
+    Raises ValueError or TypeError if a mapping is invalid.
+    """
+    return tuple(mark if isinstance(mark, Mark) else converted(_plain(mark), Mark) for mark in marks)
+
+
+def _plain(mark: Mapping[str, Any]) -> Any:
+    return msgspec.to_builtins(dict(mark), enc_hook=plain_value, builtin_types=(Decimal,))
 
 
 Marks = Annotated[
