@@ -247,14 +247,40 @@ def test_the_first_progress_of_a_set_is_of_its_own_goal() -> None:
     run(work)
 
 
+class Stage:
+    """What a flight uses of a stage."""
+
+    def __init__(self, robot: Robot, mover: Mover) -> None:
+        self.robot, self.mover = robot, mover
+
+    async def link(self) -> Stage:
+        return self
+
+    def flight(self) -> Flight:
+        flight = Flight(cast(Any, None), lambda _: self.robot.move_to(0.1, 0.0, 0.0), False, "flight")
+        flight.parent = cast(Any, self)
+        return flight
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_readings_end_with_a_plan_that_does_not_complete_its_flights(times: int) -> None:
+    async def work(robot: Robot, mover: Mover) -> None:
+        flight = Stage(robot, mover).flight()
+
+        async def plan() -> None:
+            for _ in range(times):
+                await flight.kickoff()
+                robot.end("done")
+
+        await asyncio.create_task(plan())
+        await until(lambda: flight._sampling is None)
+
+    run(work)
+
+
 def test_a_flight_that_is_stopped_while_its_path_is_sent_does_not_fly() -> None:
     async def work(robot: Robot, mover: Mover) -> None:
-        class Stage:
-            async def link(self) -> Any:
-                return type("Link", (), {"robot": robot, "mover": mover})
-
-        flight = Flight(cast(Any, None), lambda _: robot.move_to(0.1, 0.0, 0.0), False, "flight")
-        flight.parent = cast(Any, Stage())
+        flight = Stage(robot, mover).flight()
         robot.accepts.clear()
         begun = flight.kickoff()
         await until(lambda: len(robot.targets) == 1)

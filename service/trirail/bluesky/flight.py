@@ -86,6 +86,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
 
     async def _kickoff(self) -> None:
         link = await self._stage.link()
+        self._end_sampling()  # that of a path for which the plan has not called `complete`
         self._goal, self._samples = None, []
         self._stopped = False
         self._sending = asyncio.Lock()  # a lock of this event loop
@@ -161,7 +162,8 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
             yield {"time": next(iter(stamps.values())), "data": values, "timestamps": stamps}
 
     def _end_with_plan(self, begun: AsyncStatus[None]) -> None:
-        """Stop the path if it is starting or in progress; called when the plan ends."""
+        """Stop the path if it is starting or in progress, and end its readings; called when the plan ends."""
+        self._end_sampling()
         under_way = self._goal is not None and self._goal.result is None
         if under_way or not begun.done:
             self._stopping = asyncio.create_task(self._stop_late())
