@@ -7,16 +7,19 @@ import pty
 import select
 import threading
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.cli import pendant
 from trirail.cli.pendant import KEY_TIMEOUT_S, Pendant, keys
-from trirail.client import held_jog
+from trirail.client import held_jog, picture
+from trirail.errors import ServiceError
 from waiting import wait_until
 
 TOP = (0.25, 0.25, 1.5)
@@ -75,6 +78,18 @@ def test_a_key_that_a_serial_line_sends_byte_by_byte_is_the_same_key(
         os.close(keyboard)
         os.close(terminal)
     assert pressed == found
+
+
+@pytest.mark.parametrize("show", [pendant.run, lambda robot: picture.html(robot.told, robot.state())])
+def test_a_service_of_another_version_is_told_in_one_line(
+    show: Callable[[Any], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = SimpleNamespace(isatty=lambda: True)
+    monkeypatch.setattr(pendant, "sys", SimpleNamespace(stdin=stream, stdout=stream))
+    robot = FakeRobot()
+    robot.told = msgspec.structs.replace(robot.told, limits={"platform": {}})
+    with pytest.raises(ServiceError, match="the service has another version"):
+        show(robot)
 
 
 class Operator:

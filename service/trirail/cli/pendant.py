@@ -20,13 +20,11 @@ from typing import Self
 from rich.live import Live
 from rich.text import Text
 
-from trirail.cli import terminal
+from trirail.cli import live, terminal
 from trirail.client.client import Robot
 from trirail.client.goal import Velocity
 from trirail.client.held_jog import SPEEDS, USUAL, HeldJog
-from trirail.config import Limits
 from trirail.errors import ServiceError, TrirailError
-from trirail.wire.decoding import converted
 from trirail.wire.goals import Tool
 from trirail.wire.state import State
 from trirail.wire.text import printable
@@ -178,12 +176,12 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
         raise ServiceError(
             "jogging with keys needs a terminal; without a terminal, use trirail jog VX VY W --seconds S"
         )
-    top = converted(robot.info().limits, Limits).platform.velocity
+    top = live.limits_of(robot.info()).platform.velocity
     pendant = Pendant(robot, top, tool)
     with _StateReader(robot) as newest:
         try:
-            with Live(console=terminal.out, auto_refresh=False, transient=True) as live, _raw(pendant):
-                _serve(pendant, newest, live)
+            with Live(console=terminal.out, auto_refresh=False, transient=True) as display, _raw(pendant):
+                _serve(pendant, newest, display)
         except (KeyboardInterrupt, _TerminalClosed, OSError):
             pass  # OSError: the terminal has closed
         finally:
@@ -191,7 +189,7 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
     return 0
 
 
-def _serve(pendant: Pendant, newest: _StateReader, live: Live) -> None:
+def _serve(pendant: Pendant, newest: _StateReader, display: Live) -> None:
     descriptor = sys.stdin.fileno()
     drawn, last = -math.inf, time.monotonic()
     begun = b""
@@ -213,7 +211,7 @@ def _serve(pendant: Pendant, newest: _StateReader, live: Live) -> None:
         pendant.tick(now)
         last = now
         if now - drawn > REDRAW_S:
-            live.update(_shown(pendant, newest.state), refresh=True)
+            display.update(_shown(pendant, newest.state), refresh=True)
             drawn = now
 
 

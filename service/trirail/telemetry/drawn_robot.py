@@ -74,21 +74,18 @@ class DrawnRobot:
     def from_info(cls, info: Info) -> DrawnRobot:
         """Return the data of a service's robot, given the description that the service sends.
 
-        Raises ServiceError if the service has another version, whose description cannot be used.
+        Raises ServiceError if the service has an incompatible version.
         """
+        each = [_leg(leg) for leg in info.geometry]
         try:
-            return cls._described(info)
+            legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)
+            limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)
+            geometry = config.geometry(legs)
         except (msgspec.ValidationError, ConfigError) as error:
             raise ServiceError(f"the service has another version, {info.version}: {error}") from error
-
-    @classmethod
-    def _described(cls, info: Info) -> DrawnRobot:
-        each = [_leg(leg) for leg in info.geometry]
-        legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)
-        limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)
         outputs = [_signal("output", name, line.drive, line.bit) for name, line in info.output_lines.items()]
         inputs = [_signal("input", name, line.drive, line.bit) for name, line in info.input_lines.items()]
-        return cls(info.robot, config.geometry(legs), limits, info.rate_hz, frames, (*outputs, *inputs))
+        return cls(info.robot, geometry, limits, info.rate_hz, frames, (*outputs, *inputs))
 
 
 def _signal(kind: Literal["output", "input"], name: str, drive: str, bit: int) -> DigitalSignal:
