@@ -250,6 +250,21 @@ def test_the_command_line_sends_a_command_with_the_numbers_that_it_cannot_come_w
         made(["override", "--connect", connect], exit_on_error=False, print_error=False)
 
 
+@pytest.mark.parametrize("kind", [Robot, AsyncRobot])
+@pytest.mark.parametrize("content", [None, b"{}", Stop()])
+@pytest.mark.parametrize("name", ["bogus", "", "STOP", "stop/now", "st*", "stop#", "stop?", "*", "/", "$"])
+def test_a_command_that_there_is_not_is_refused_and_not_sent(
+    name: str, content: CommandContent | bytes | None, kind: type[Robot | AsyncRobot], connect: str
+) -> None:
+    async def run() -> None:
+        async with client(kind, connect) as robot:
+            with refused_as(RefusalCode.UNKNOWN_COMMAND):
+                await done(robot, lambda robot, order: robot.command(*order), (name, content))
+            assert SERVICE[0].taken() == []
+
+    asyncio.run(run())
+
+
 class Label(CommandContent, frozen=True):
     """A content that no command has yet, with a field of each plain type."""
 

@@ -87,11 +87,13 @@ def too_many(number: int) -> str:
 def content_message(name: str, content: CommandContent | bytes | None) -> bytes | None:
     """Return the content of a command as JSON; None if `content` is None.
 
-    Raises RefusedError if the command does not accept this content. Content that is already JSON is not checked.
+    Raises RefusedError for an unknown command, or if the command does not accept this content. Content that is already
+    JSON is not checked.
     """
+    command = boundary.command_named(name)
     if content is None or isinstance(content, bytes):
         return content
-    return made_content(Command(name), lambda: content)
+    return made_content(command, lambda: content)
 
 
 def made_content(command: Command, make: Callable[[], CommandContent]) -> bytes:

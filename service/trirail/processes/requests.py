@@ -24,6 +24,7 @@ from trirail.processes.loop_death import LoopDeath
 from trirail.processes.publications import StateMaker
 from trirail.processes.replies import Replies
 from trirail.processes.session_guard import Guard
+from trirail.wire import boundary
 from trirail.wire.goals import Goal, LoopGoal
 from trirail.wire.links import PacketLink
 from trirail.wire.looks import SUCCESSFUL_ENDS, AlignmentLook, alignment_event_text, in_words
@@ -210,11 +211,7 @@ class CommandReader:
 
     def read(self, incoming: Incoming, user: str, command: str) -> None:
         """Carry out a command, unless it is a copy of an earlier one. Raises RefusedError for an unknown command."""
-        try:
-            name = Command(command)
-        except ValueError as error:
-            problem = f"unknown command {quoted(command)}: use one of {', '.join(Command)}"
-            raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
+        name = boundary.command_named(command)
         fresh = self._replies.without_copies(incoming) if name in STOPS else incoming
         if fresh is None:
             return

@@ -58,6 +58,15 @@ def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
     return parts
 
 
+def command_named(name: str) -> Command:
+    """Return the command with this name. Raises RefusedError for an unknown command."""
+    try:
+        return Command(name)
+    except ValueError as error:
+        problem = f"unknown command {quoted(name)}: use one of {', '.join(Command)}"
+        raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
+
+
 def check_size(size: int) -> None:
     """Raise RefusedError if a message exceeds the maximum size."""
     if size > MAX_MESSAGE:
