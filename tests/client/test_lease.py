@@ -97,6 +97,20 @@ def test_what_ends_it_is_kept_and_nothing_is_asked_any_more(loop: LoopThread, er
     assert {service.next()[0] for _ in range(service.asked.qsize())} == {Command.ACQUIRE}
 
 
+def test_a_lease_ends_with_its_time_out_if_the_service_does_not_answer(loop: LoopThread) -> None:
+    asked: list[Command] = []
+
+    async def command(name: Command, _content: bytes) -> CommandReply:
+        asked.append(name)
+        if asked.count(Command.ACQUIRE) > 2 and name is Command.ACQUIRE:
+            await asyncio.Event().wait()
+        return CommandReply(name, Mode.HOLDING, 0)
+
+    with Lease(AsyncLease(command, force=False, timeout=0.5), loop) as lease:
+        assert lease.wait(10.0), "it counts as held"
+        assert isinstance(lease.lost, ServiceError)
+
+
 def test_who_does_not_get_it_keeps_nothing_up(loop: LoopThread) -> None:
     service = Service(loop)
     service.refusal = RefusedError(RefusalCode.LEASED, "bob holds the lease")

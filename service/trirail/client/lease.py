@@ -68,15 +68,16 @@ class AsyncLease:
     async def _keep(self) -> None:
         sign, now = msgspec.json.encode(self._sign), asyncio.get_running_loop().time
         until = now() + self._sign.timeout
-        while True:
+        while self.lost is None:
             await asyncio.sleep(self._sign.timeout / SIGNS)
             sent = now()
             try:
-                await self._command(Command.ACQUIRE, sign)
+                async with asyncio.timeout(self._sign.timeout):
+                    await self._command(Command.ACQUIRE, sign)
                 until = sent + self._sign.timeout
+            except TimeoutError:
+                self.lost = ServiceError(f"the service has not renewed the lease within {self._sign.timeout:g} s")
             except TrirailError as error:
-                if isinstance(error, ServiceError) and now() < until:  # for example, the gateway is being restarted
-                    continue
-                self.lost = error
-                self._over.set()
-                return
+                if not isinstance(error, ServiceError) or now() >= until:  # otherwise, the gateway may be restarting
+                    self.lost = error
+        self._over.set()
