@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
+from trirail.client.outgoing import too_many
 from trirail.client.trajectory import points_of, read
 from trirail.errors import TrirailError
 from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
+from trirail.wire.sizes import MAX_POINTS
 
 HEAD = ("t", "x", "y", "phi", "vx", "vy", "w")
 NUMBER = st.floats(-100.0, 100.0)
@@ -81,6 +84,14 @@ def test_more_points_than_fit_are_refused_before_sending_with_both_numbers(tmp_p
     for points in (rows, path):
         with pytest.raises(TrirailError, match=rf"{number} points exceed the maximum of 5000: send one in "):
             points_of(points)
+
+
+@given(st.integers(MAX_POINTS + 1, 100 * MAX_POINTS))
+@example(2 * MAX_POINTS)
+def test_as_many_points_as_the_refusal_advises_fit(number: int) -> None:
+    advice = re.search(r"send one in (\d+) points and the last", too_many(number))
+    assert advice is not None
+    assert len({*range(0, number, int(advice[1])), number - 1}) <= MAX_POINTS
 
 
 @pytest.mark.parametrize("begins", [-86_400.5, 1e6, 1_795_245_300.25])

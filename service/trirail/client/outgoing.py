@@ -77,7 +77,7 @@ def too_many(number: int) -> str:
     """Return an error message with a remedy if a trajectory has too many points to be sent; otherwise ""."""
     if number <= MAX_POINTS:
         return ""
-    step = -(-number // MAX_POINTS)
+    step = -(-(number - 1) // (MAX_POINTS - 1))
     return (
         f"{number} points exceed the maximum of {MAX_POINTS}: send one in {step} points and the last, since paths "
         "are quintic between points, or send parts that each end at rest"
