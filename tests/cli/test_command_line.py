@@ -19,9 +19,9 @@ from typing import Any
 import msgspec
 import pytest
 from cyclopts import App
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from trirail.cli import app, help_pages, live, notation, terminal, view
+from trirail.cli import app, help_pages, live, notation, recording_commands, terminal, view
 from trirail.client import client, connection
 from trirail.client.goal import Result
 from trirail.config import SIM, load
@@ -286,6 +286,14 @@ def test_what_is_not_utf_8_is_refused_in_a_line(run: Run) -> None:
     assert "not a goal" in run("goal", f'{{"kind": "{not_utf_8}"}}', "--connect", NOBODY)[2]
     message = json.loads(run("follow", f"{not_utf_8}.csv", "--json")[1])["message"]
     assert message.startswith(f"{not_utf_8}.csv: No such file")
+
+
+@given(st.floats(120.0, 1e6))
+@example(179.7)
+def test_a_report_has_no_minute_of_sixty_seconds(time: float) -> None:
+    minutes, _, seconds, _ = recording_commands._seconds(time).split()
+    assert int(seconds) < 60
+    assert abs(60 * int(minutes) + int(seconds) - time) <= 0.5
 
 
 WRONG = ["report", "replay", "goto", "goto 1 2", "nothing", "watch extra", "status --wat", "config wat"]
