@@ -280,6 +280,25 @@ def test_a_subscription_ends_with_who_iterates(silent: Silent, locator: str) -> 
     assert heard == []
 
 
+def test_whoever_waits_is_told_that_the_robot_was_closed(silent: Silent, locator: str) -> None:
+    async def main() -> None:
+        async with asyncio.timeout(WITHIN), AsyncRobot("demo", locator, user="ann") as robot:
+            sending = asyncio.ensure_future(robot.move_to(x=0.0, y=0.0, phi=0.0, id="g"))
+            await asyncio.to_thread(silent.answer, GoalReply("g", 1.0))
+            goal = await sending
+            first: list[Awaitable[object]] = [anext(robot.states()), anext(robot.events())]
+            calls = [call(robot) for call in CALLS.values()]
+            waiting = [asyncio.ensure_future(each) for each in (goal.wait(), robot.stop(), *first, *calls)]
+            await asyncio.sleep(0.05)
+            assert not any(task.done() for task in waiting)
+            await robot.close()
+            for task in (*waiting, asyncio.ensure_future(goal.wait())):
+                with pytest.raises(ServiceError, match="the connection is closed"):
+                    await task
+
+    asyncio.run(main())
+
+
 def test_opening_that_is_cancelled_leaves_no_connection(silent: Silent, locator: str) -> None:
     async def main() -> None:
         opening = asyncio.ensure_future(AsyncRobot("demo", locator).__aenter__())

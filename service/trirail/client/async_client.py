@@ -98,8 +98,11 @@ class AsyncRobot:
         await self.close()
 
     async def close(self) -> None:
-        """Close the connection; accepted goals continue."""
-        self._open = None
+        """Close the connection; accepted goals continue. Calls of other tasks that wait raise ServiceError."""
+        opened, self._open = self._open, None
+        if opened is not None:
+            opened.close()
+        self._goals.close()
         await self._opened.aclose()
 
     def _connected(self) -> Connection:

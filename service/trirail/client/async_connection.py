@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, aclosing
 from typing import Any, TypeVar
 
 import msgspec
 import zenoh
 
-from trirail.client.connection import HERE_WITHIN, REPLY_WITHIN, ROLE_WITHIN, Connection, SilenceError, once
-from trirail.client.stop_call import Outcome, StopOrder
+from trirail.client.connection import CLOSED, HERE_WITHIN, REPLY_WITHIN, ROLE_WITHIN, Connection, SilenceError, once
+from trirail.client.stop_call import StopOrder
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.wire.messages import CommandReply, Event, RoleReply
 from trirail.wire.state import State
 
 T = TypeVar("T", bound=msgspec.Struct)
-Item = TypeVar("Item")
 
 
 class AsyncConnection:
@@ -30,6 +29,15 @@ class AsyncConnection:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._loop = asyncio.get_running_loop()
+        self._queues: set[asyncio.Queue[Any]] = set()
+        """Queues from which tasks read."""
+        self._closed = False
+
+    def close(self) -> None:
+        """End the calls and iterations of all tasks with a ServiceError. The connection itself stays open."""
+        self._closed = True
+        for queue in self._queues:
+            queue.put_nowait(None)  # wakes the task
 
     @property
     def skipped(self) -> int:
@@ -77,11 +85,10 @@ class AsyncConnection:
 
         Raises the same errors as `fetch`.
         """
-        came: asyncio.Queue[Outcome] = asyncio.Queue()
         stop = StopOrder.create(self._connection.robot, user, name, content, within)
-        with self._connection.copies(stop, self._in_loop(came.put_nowait)) as outcomes:
+        with self._queue() as came, self._connection.copies(stop, self._in_loop(came.put_nowait)) as outcomes:
             try:
-                while (reply := outcomes.decide(await came.get())) is None:
+                while (reply := outcomes.decide(await self._next(came))) is None:
                     pass
             except SilenceError as error:
                 raise await self.nobody("cmd", user, name) from error
@@ -116,25 +123,24 @@ class AsyncConnection:
 
         End after `timeout` seconds without a state.
         """
-        newest: asyncio.Queue[State] = asyncio.Queue()
+        with self._queue() as newest:
 
-        def keep_newest(state: State) -> None:
-            while not newest.empty():
-                newest.get_nowait()
-            newest.put_nowait(state)
+            def keep_newest(state: State) -> None:
+                while not newest.empty():
+                    newest.get_nowait()
+                newest.put_nowait(state)
 
-        with self._connection.subscribe_to_states(self._in_loop(keep_newest)):
-            async for state in _items_until_timeout(newest, timeout):
-                yield state
+            with self._connection.subscribe_to_states(self._in_loop(keep_newest)):
+                async for state in self._items_until_timeout(newest, timeout):
+                    yield state
 
     async def events(self, history: bool, timeout: float | None) -> AsyncGenerator[Event]:
         """Yield each event once, in order; with `history`, begin with the past events.
 
         End after `timeout` seconds without an event.
         """
-        received: asyncio.Queue[Event] = asyncio.Queue()
-        with self.subscribe_to_events(once(received.put_nowait), history=history):
-            async for event in _items_until_timeout(received, timeout):
+        with self._queue() as received, self.subscribe_to_events(once(received.put_nowait), history=history):
+            async for event in self._items_until_timeout(received, timeout):
                 yield event
 
     def overtaken(self, state: State) -> bool:
@@ -156,17 +162,17 @@ class AsyncConnection:
 
         `get_of` returns the method of the session that sends the query.
         """
-        replies: asyncio.Queue[zenoh.Reply | None] = asyncio.Queue()
         left = zenoh.CancellationToken()
-        over = self._in_loop(lambda: replies.put_nowait(None))
-        handler = zenoh.handlers.Callback(self._in_loop(replies.put_nowait), over, indirect=False)
-        with self._connection.open_session() as session:
-            get_of(session)(handler=handler, cancellation_token=left, **query)
-        try:
-            while (reply := await replies.get()) is not None:
-                yield reply
-        finally:
-            left.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
+        with self._queue() as replies:
+            over = self._in_loop(lambda: replies.put_nowait(None))
+            handler = zenoh.handlers.Callback(self._in_loop(replies.put_nowait), over, indirect=False)
+            with self._connection.open_session() as session:
+                get_of(session)(handler=handler, cancellation_token=left, **query)
+            try:
+                while (reply := await self._next(replies)) is not None:
+                    yield reply
+            finally:
+                left.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
 
     def _in_loop(self, deliver: Callable[..., None]) -> Callable[..., None]:
         """Return a callback for Zenoh's threads that calls `deliver` in the event loop."""
@@ -177,13 +183,29 @@ class AsyncConnection:
 
         return deliver_in_loop
 
-
-async def _items_until_timeout(received: asyncio.Queue[Item], timeout: float | None) -> AsyncGenerator[Item]:
-    """Yield received items until none arrives for `timeout` seconds."""
-    while True:
+    @contextlib.contextmanager
+    def _queue(self) -> Iterator[asyncio.Queue[Any]]:
+        """Yield a queue from which a task reads with `_next`."""
+        queue: asyncio.Queue[Any] = asyncio.Queue()
+        self._queues.add(queue)
         try:
-            async with asyncio.timeout(timeout):
-                item = await received.get()
-        except TimeoutError:
-            return
-        yield item
+            yield queue
+        finally:
+            self._queues.discard(queue)
+
+    async def _next(self, queue: asyncio.Queue[Any]) -> Any:
+        """Return the next item of a queue. Raises ServiceError if `close` is called before the item is read."""
+        item = None if self._closed else await queue.get()
+        if self._closed:
+            raise ServiceError(CLOSED)
+        return item
+
+    async def _items_until_timeout(self, received: asyncio.Queue[Any], timeout: float | None) -> AsyncGenerator[Any]:
+        """Yield received items until none arrives for `timeout` seconds."""
+        while True:
+            try:
+                async with asyncio.timeout(timeout):
+                    item = await self._next(received)
+            except TimeoutError:
+                return
+            yield item

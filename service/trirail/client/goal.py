@@ -11,8 +11,9 @@ from typing import NamedTuple, Self
 
 import msgspec
 
+from trirail.client.connection import CLOSED
 from trirail.client.outgoing import number, seconds
-from trirail.errors import RefusalCode, RefusedError, TrirailError, WaitTimeoutError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError, WaitTimeoutError
 from trirail.wire.goals import Goal, Tool, VelocityGoal
 from trirail.wire.marks import Switch
 from trirail.wire.messages import Event, GoalReply, Residual
@@ -101,18 +102,21 @@ class AsyncGoalHandle:
     async def wait(self, timeout: float | None = None) -> Result:
         """Wait until the goal ends; return its result. The `outcome` of the result is "done" if the goal succeeded.
 
-        Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues.
+        Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues. Raises ServiceError
+        if the client is closed before the goal ends.
         """
         within = seconds(timeout)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within):
                 await self._ended.wait()
+        if self._result is None and self._ended.is_set():
+            raise ServiceError(CLOSED)
         if self._result is None:
             raise WaitTimeoutError(f"goal {self.id} has not ended within {within:g} s")
         return self._result
 
-    def end(self, result: Result) -> None:
-        """Set the result, and wake the tasks that wait for the goal."""
+    def end(self, result: Result | None) -> None:
+        """Set the result, which is None if the client is closed before, and wake the tasks that wait for the goal."""
         self._result = result
         self._ended.set()
 
@@ -159,6 +163,11 @@ class OpenGoals:
         self._accepted.discard(result.id)
         if (handle := self._handles.pop(result.id, None)) is not None:
             handle.end(result._replace(marks=tuple(self._switches.pop(result.id, ()))))
+
+    def close(self) -> None:
+        """End the waits for all goals, because no further event arrives."""
+        for handle in self._handles.values():
+            handle.end(None)
 
     def note_switches(self, switches: Iterable[Switch]) -> None:
         """Store output switches for the results of their goals; ignore switches of goals that are not registered.
