@@ -6,7 +6,7 @@ import re
 
 import pytest
 from control.test_control import PERIOD, assert_within_limits
-from control_rig import CONFIG, ControlRig
+from control_rig import CONFIG, ControlRig, expected_duration
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refusal
@@ -125,3 +125,33 @@ def test_an_acceleration_at_an_end_is_bound_by_the_jerk_limit_over_one_cycle(rig
             rig.goal(f"back{at}{share}", 0.0, 0.0, 0.0)
             rig.until(rig.holds)
     assert_within_limits(rig)
+
+
+PAUSE = st.floats(0.1, 50_000.0)
+
+
+def after_a_pause(pause: float, x: float, seconds: float) -> TrajectoryGoal:
+    """Return a motion along x in so many seconds, which begins after a pause."""
+    points = [TrajectoryPoint(t, 0.0, 0.0, 0.0, velocity=STILL, acceleration=STILL) for t in (0.0, pause)]
+    return TrajectoryGoal((*points, TrajectoryPoint(pause + seconds, x, 0.0, 0.0)))
+
+
+@settings(max_examples=20)
+@given(PAUSE)
+def test_the_end_of_a_long_one_is_checked_like_its_start(pause: float) -> None:
+    rig = ControlRig()
+    rig.enable()
+    assert refusal(rig.send("far", after_a_pause(pause, 0.2, 5.0))).code == "out_of_workspace"
+    assert refusal(rig.send("fast", after_a_pause(pause, 0.05, 0.1))).code == "too_fast"
+    assert isinstance(rig.send("fits", after_a_pause(pause, 0.05, 1.0)), Accepted)
+
+
+@settings(max_examples=20)
+@given(PAUSE)
+def test_the_end_of_a_long_one_bounds_the_override(pause: float) -> None:
+    rig = ControlRig()
+    rig.enable()
+    rig.command("override", 2.0)
+    goal = after_a_pause(pause, 0.05, 0.5)
+    rate = goal.points[-1].t / expected_duration(rig.send("g", goal))
+    assert 1.0 <= rate < 1.5

@@ -45,8 +45,6 @@ KNOTS_PER_PART = 48
 """Number of knots of a path that are sampled in one call. Each call takes at least MIN_SAMPLES samples."""
 SLOWDOWN_EXPONENTS = 1.0 / np.arange(1.0, 4.0)
 """Exponents that convert factors of velocity, acceleration and jerk into a factor of time."""
-MAX_SAMPLED_S = 600.0
-"""Longest part of a path that is sampled in one call [s]."""
 
 
 class SampleResult(NamedTuple):
@@ -164,11 +162,11 @@ class Checker:
         every loop in the planner samples a path in each iteration.
         """
         self._beat()
-        until = max(first, min(until, first + MAX_SAMPLED_S))
+        until = max(first, until)
         # A path from standstill may begin with an acceleration. The jerk of this step must be included, as at the end.
         if first == 0.0 and law.pieces[0, 0, 0] == 0.0 and not path.pieces[0, :, 1].any():
             first = -self._period
-        even = min(max(MIN_SAMPLES, int((until - first) / SAMPLE_INTERVAL_S)), MAX_SAMPLES)
+        even = int(min(max(MIN_SAMPLES, (until - first) / SAMPLE_INTERVAL_S), MAX_SAMPLES))
         worst, start = np.zeros((len(SUBJECTS), 3)), np.array(pose, dtype=np.float64)
         leaves_at = survey(
             self._legs,
