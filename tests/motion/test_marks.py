@@ -94,6 +94,23 @@ def test_marks_lie_where_an_independent_integration_has_them(kind: str, seed: in
 
 
 @pytest.mark.parametrize("kind", ROBOTS)
+@pytest.mark.parametrize("coordinate", range(3))
+@pytest.mark.generated(*range(10))
+def test_a_mark_may_be_at_the_start_or_the_target(kind: str, coordinate: int, seed: int) -> None:
+    """Rounding may end the path a little before the target."""
+    rng = np.random.default_rng(seed)
+    begin, target = (np.round(rng.uniform(-1.0, 1.0, 3) * (0.004, 0.004, 0.02), 4).tolist() for _ in range(2))
+    config = ROBOTS[kind]
+    planner = GoalPlanner(corrected_geometry(config), config.limits, config.period)
+    run = planner.plan(PoseGoal(*target), Schedule(rest(begin), config.period), 1.0, 3).run
+    name = ("x", "y", "phi")[coordinate]
+    marks = [Mark("valve", at=Crossing(**{name: pose[coordinate]})) for pose in (begin, target)]
+    first, last = placed(kind, run, *marks).marks
+    assert first.time == 0.0
+    assert last.pose[coordinate] == pytest.approx(target[coordinate], abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", ROBOTS)
 def test_a_repetition_has_its_pulses_an_increment_apart(kind: str) -> None:
     run = planned(kind, PoseGoal(0.004, 0.0, 0.0, speed=0.2))
     s, _, places = traced(run, (0.0, 0.0))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
-from trirail.motion.paths import Path, constant_law, path_motion, platform_at_law_time
+from trirail.motion.paths import ROUNDING, Path, constant_law, path_motion, platform_at_law_time
 from trirail.wire.marks import Mark, PlacedMark
 
 SWITCH: Final = np.dtype([("s", "<f8"), ("width", "<f8"), ("mark", "<i4"), ("on", "<i4")], align=True)
@@ -200,6 +200,7 @@ class _Trace:
     def crossing(self, coordinate: int, value: float) -> float | None:
         """Return the first time at which a coordinate reaches or crosses a value; None if it never does."""
         offset = self.coordinates[:, coordinate] - value
+        offset[np.abs(offset) <= ROUNDING] = 0.0  # rounding may end the path a little before its target
         if offset[0] == 0.0:
             return 0.0
         crossed = np.flatnonzero(np.sign(offset[1:]) != np.sign(offset[0]))
