@@ -180,6 +180,19 @@ def test_a_target_out_of_a_sliders_travel_is_waited_for_too(rig: ControlRig) -> 
     assert_within_limits(rig)
 
 
+@pytest.mark.parametrize("timeout", [0.03, 0.05, 0.1])
+@pytest.mark.parametrize("speed", [0.05, 0.1, 0.2])
+def test_before_the_border_every_report_of_a_target_is_accepted(rig: ControlRig, speed: float, timeout: float) -> None:
+    """The robot may have to brake at once, for longer than the time-out of the track."""
+    rig.enable()
+    told = regular(1.5 / timeout, 0.2 / speed)
+    track(rig, lambda t: ((speed * t, 0.0, 0.0), (speed, 0.0, 0.0)), told, timeout=timeout)
+    assert [answer for answer in rig.answers if isinstance(answer, Refused)] == []
+    rig.until(rig.holds)
+    assert rig.control.fault is None
+    assert_within_limits(rig)
+
+
 def test_a_target_that_leaves_through_the_border_and_comes_back(rig: ControlRig) -> None:
     """The platform brakes before the border, and goes on with it when it is back."""
     rig.enable()

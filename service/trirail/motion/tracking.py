@@ -169,7 +169,7 @@ class Tracker:
             if math.isnan(result.leaves_at) or result.leaves_at <= max(meeting.duration, brake.duration):
                 break
             bound = self._checker.bound(path, result.leaves_at, start.pose)
-            until = min(until, result.leaves_at) - brake.duration
+            until = max(0.0, min(until, result.leaves_at) - brake.duration)
         return path, result, bound
 
     def _quickest_meeting(
