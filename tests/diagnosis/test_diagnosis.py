@@ -268,6 +268,51 @@ def test_of_three_limits_the_one_that_is_wrong_is_named(name: str, leg: int) -> 
     assert (key, said.partition(":")[0]) == (f"limits.slider.position[{leg}]", f"{key} = [-0.01, 10]")
 
 
+FAST = {"position": (-0.1, 0.3), "velocity": 0.9, "acceleration": 100.0, "jerk": 1e5}
+
+
+@pytest.mark.parametrize("leg", range(3))
+@pytest.mark.parametrize(
+    ("spoilt", "name", "verdict"),
+    [
+        ({"position": (-0.1, 0.4)}, "rail", "failure"),
+        (FAST, "rail", "warning"),
+        (FAST, "quick stop", "failure"),
+    ],
+)
+def test_stops_of_every_slider_are_checked(leg: int, spoilt: dict[str, Any], name: str, verdict: str) -> None:
+    """Whichever slider needs the largest part of its travel for a stop."""
+    config = load(SIM.with_name("vcan.toml"))
+    config = msgspec.structs.replace(config, can=msgspec.structs.replace(config.can, channel="can0"))
+    slow = {"position": (-0.001, 0.001), "velocity": 0.01, "acceleration": 0.1, "jerk": 100.0}
+    three = {
+        key: tuple((spoilt.get(key, value), value, value)[k - leg] for k in range(3)) for key, value in slow.items()
+    }
+    slider = msgspec.structs.replace(config.limits.slider, **three)
+    drives = msgspec.structs.replace(config.drives, quick_stop_deceleration=1.0, stop_timeout=0.5)
+    config = msgspec.structs.replace(
+        config, limits=msgspec.structs.replace(config.limits, slider=slider), drives=drives
+    )
+    assert (name, verdict) in {(each.name, each.verdict) for each in diagnose(config)}
+
+
+def test_a_zero_is_compared_with_the_travel_of_its_own_slider() -> None:
+    """Measured legs do not tell where rails end."""
+    config = load(SIM.with_name("uvw.toml"))
+    slider, first = config.limits.slider, config.drives.A
+    assert config.geometry.l0 is None
+    three = ((0.5, 0.6), slider.positions[1], slider.positions[2])
+    limits = msgspec.structs.replace(config.limits, slider=msgspec.structs.replace(slider, position=three))
+
+    def found(offset: float) -> set[str]:
+        drives = msgspec.structs.replace(config.drives, A=msgspec.structs.replace(first, offset=offset))
+        checks = diagnose(msgspec.structs.replace(config, limits=limits, drives=drives))
+        return {each.key for each in checks if each.name == "offset"}
+
+    assert found(0.55) == set()
+    assert found(0.0) == {"drives.A.offset"}
+
+
 @given(v=st.floats(1e-3, 10.0), a=st.floats(0.01, 100.0), j=st.floats(0.1, 1e5), q=st.floats(0.01, 100.0))
 def test_stops_are_those_of_the_motion_itself(v: float, a: float, j: float, q: float) -> None:
     """A controlled stop, integrated: jerk -j until -a is reached or half of v is gone, then -a, then j."""

@@ -14,7 +14,7 @@ from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config
 from trirail.diagnosis.check import Check, ConfigCheck
-from trirail.diagnosis.stopping import stops
+from trirail.diagnosis.stopping import each_stops
 
 MAX_SCALE_RATIO = 8.0
 """Greatest plausible ratio between the scales of two drives of one robot."""
@@ -58,9 +58,8 @@ def _zero(config: Config) -> Iterator[Check]:
 
     The result is only a warning for drives without homing, since the zero of an absolute encoder may be off the rail.
     """
-    stop = stops(config)
-    low, high = stop.rail or stop.travel
-    for name, drive in zip(NAMES, config.drives.each, strict=True):
+    for name, drive, stop in zip(NAMES, config.drives.each, each_stops(config), strict=True):
+        low, high = stop.rail or stop.travel
         if min(low, stop.travel[0]) <= drive.offset <= max(high, stop.travel[1]):
             continue
         homes, key = drive.homing is not None, f"drives.{name}.offset"

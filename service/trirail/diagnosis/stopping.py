@@ -34,9 +34,19 @@ class Stops(Struct, frozen=True):
         """Length of the rail outside the travel, on the side where it is shorter [m]; None if the rail is unknown."""
         return None if self.rail is None else min(self.travel[0] - self.rail[0], self.rail[1] - self.travel[1])
 
+    @property
+    def longer(self) -> float:
+        """Distance of the longer of the two stops [m]."""
+        return max(self.way, self.quick_way)
+
 
 def stops(config: Config) -> Stops:
-    """Return the stops of the slider for which a controlled stop needs the largest fraction of the travel.
+    """Return the stops of the slider for which a controlled stop needs the largest fraction of the travel."""
+    return max(each_stops(config), key=lambda each: each.way / (each.travel[1] - each.travel[0]))
+
+
+def each_stops(config: Config) -> list[Stops]:
+    """Return the stops of the sliders A, B, C.
 
     A controlled stop from velocity v with acceleration limit a and jerk limit j takes the time t = v / a + a / j, or
     t = 2 sqrt(v / j) if the acceleration does not reach a. The distance is v t / 2. A quick stop with deceleration q
@@ -51,7 +61,7 @@ def stops(config: Config) -> Stops:
     for v, a, j, travel in zip(slider.velocities, slider.accelerations, slider.jerks, slider.positions, strict=True):
         time = v / a + a / j if v >= a * a / j else 2.0 * math.sqrt(v / j)
         candidates.append(Stops(v, v * time / 2.0, time, v * v / (2.0 * quick), v / quick, travel, rail))
-    return max(candidates, key=lambda each: each.way / (each.travel[1] - each.travel[0]))
+    return candidates
 
 
 def _rail(config: Config) -> Iterator[Check]:
@@ -59,10 +69,11 @@ def _rail(config: Config) -> Iterator[Check]:
 
     This can happen if the scale or the home position of the slider is wrong.
     """
-    stop = stops(config)
+    every = each_stops(config)
+    outermost = min(every, key=lambda each: each.left or 0.0)
+    stop = outermost if (outermost.left or 0.0) < 0.0 else min(every, key=lambda each: (each.left or 0.0) - each.longer)
     speed = f"from {stop.velocity * 1e3:g} mm/s"
     ways = f"{speed} a quick stop takes {stop.quick_way * 1e3:.3g} mm, a controlled stop {stop.way * 1e3:.3g} mm"
-    longer = max(stop.way, stop.quick_way)
     if stop.left is None:
         remedy = "check that each rail extends as far beyond limits.slider.position: measured legs do not contain it"
         yield Check("rail", "ok", ways, remedy)
@@ -71,7 +82,7 @@ def _rail(config: Config) -> Iterator[Check]:
         finding = f"limits.slider.position = [{stop.travel[0]:g}, {stop.travel[1]:g}] exceeds the rails: with "
         finding += f"geometry.l0 = {config.geometry.l0:g} m they end at {low:.4g} and {high:.4g} m"
         yield Check("rail", "failure", finding, "correct one of the two", "limits.slider.position")
-    elif longer <= stop.left:
+    elif stop.longer <= stop.left:
         yield Check("rail", "ok", f"{ways}; {stop.left * 1e3:.3g} mm are left beyond the travel")
     elif is_simulated(config.can):
         yield Check("rail", "ok", f"{ways}; {stop.left * 1e3:.3g} mm are left: enough for simulated drives")
@@ -79,7 +90,9 @@ def _rail(config: Config) -> Iterator[Check]:
         quick = stop.quick_way > stop.left
         ramp = "drives.quick_stop_deceleration" if quick else "limits.slider.acceleration and jerk"
         finding = f"{ways}; {stop.left * 1e3:.3g} mm of rail are left beyond limits.slider.position"
-        remedy = f"lower limits.slider.velocity, end the travel {longer * 1e3:.3g} mm before the rail, or raise {ramp}"
+        remedy = (
+            f"lower limits.slider.velocity, end the travel {stop.longer * 1e3:.3g} mm before the rail, or raise {ramp}"
+        )
         yield Check("rail", "warning", finding, remedy, "limits.slider.velocity")
 
 
@@ -101,7 +114,7 @@ def _quick_stop(config: Config) -> Iterator[Check]:
 
     After this time-out, the service switches the power off during the motion, with a fault.
     """
-    stop, timeout = stops(config), config.drives.stop_timeout
+    stop, timeout = max(each_stops(config), key=lambda each: each.quick_time), config.drives.stop_timeout
     key = "drives.quick_stop_deceleration"
     ramp = format_value(key, config.drives.quick_stop_deceleration, "m/s²")
     if stop.quick_time > timeout:
