@@ -418,3 +418,27 @@ def test_without_room_for_a_thread_the_attempt_has_failed_and_another_follows() 
     assert reopening.attempt(0.2) is None
     assert reopening.attempt(0.1 + 2 * RETRY_AFTER) is None
     assert reopening.attempt(0.2 + 2 * RETRY_AFTER) is bus
+
+
+def test_without_room_for_a_thread_the_lost_bus_is_closed_by_a_later_attempt() -> None:
+    """Most adapters cannot be opened before."""
+    closed: list[str] = []
+    full = [False, True]
+
+    class Lost(AbsentBus):
+        def shutdown(self) -> None:
+            closed.append(self.channel_info)
+            super().shutdown()
+
+    def start(work: Callable[[], None]) -> None:
+        if full.pop():
+            raise RuntimeError("can't start new thread")
+        work()
+
+    reopening, lost = Reopening("can0", lambda: AbsentBus("can0", ""), start), Lost("lost")
+    reopening.retire(lost)
+    reopening.attempt(0.0)
+    assert reopening.attempt(0.1) == "can't start new thread"
+    assert closed == []
+    reopening.attempt(0.1 + 2 * RETRY_AFTER)
+    assert closed == ["lost"]

@@ -85,7 +85,7 @@ class Reopening:
             try:
                 self._start(partial(self._attempt, retired))
             except RuntimeError as error:  # the system's limit on threads is reached
-                self._outcome = str(error)
+                self._retired, self._outcome = retired, str(error)
         return None
 
     def close(self) -> None:
