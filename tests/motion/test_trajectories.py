@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
-from control.test_control import PERIOD, assert_within_limits
+from control.test_control import PERIOD, ROBOT, assert_within_limits
 from control_rig import CONFIG, ControlRig, expected_duration
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refusal
+from trirail.motion.feasibility import Checker
+from trirail.motion.limits import Bounds
+from trirail.motion.quintic import Point, quintic
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
@@ -125,6 +129,23 @@ def test_an_acceleration_at_an_end_is_bound_by_the_jerk_limit_over_one_cycle(rig
             rig.goal(f"back{at}{share}", 0.0, 0.0, 0.0)
             rig.until(rig.holds)
     assert_within_limits(rig)
+
+
+@pytest.mark.parametrize("coordinate", range(3))
+@pytest.mark.generated(*range(10))
+def test_no_velocity_between_two_samples_is_above_its_limit(coordinate: int, seed: int) -> None:
+    """The points are so many that the samples are about as far apart."""
+    rng = np.random.default_rng(seed)
+    places = 0.1 * rng.uniform(0.5, 1.0, 61) * (-1.0) ** np.arange(61)
+    times, poses, velocities = np.arange(61.0), np.zeros((61, 3)), np.zeros((61, 3))
+    places[[0, -1]] = 0.0
+    poses[:, coordinate], velocities[1:-1, coordinate] = places, rng.uniform(-0.1, 0.1, 59)
+    path = quintic([Point(*row) for row in zip(times, poses.tolist(), velocities.tolist(), strict=True)], STILL)
+    t = np.linspace(0.0, 1.0, 1001)
+    most = np.abs(path.pieces[:, coordinate, 1:] @ (np.arange(1.0, 6.0)[:, None] * t ** np.arange(5.0)[:, None])).max()
+    checker = Checker(ROBOT, CONFIG.limits, Bounds(CONFIG.limits, PERIOD), PERIOD)
+    found = checker.worst_shares(path, STILL)[1 + coordinate, 0] * checker.platform_limits[coordinate, 0]
+    assert found == pytest.approx(most, rel=2e-3)
 
 
 PAUSE = st.floats(0.1, 50_000.0)

@@ -21,6 +21,11 @@ TURN_CLEARANCE = 1e-3
 UNIT_WEIGHTS = (1.0, 1.0, 1.0)
 RETURN_SLOWDOWN = 10.0
 """Factor by which velocities are reduced while the robot returns from outside its limits."""
+MIN_PEAK = 1.0 + 1e-4
+"""Estimated peak of a velocity between two samples above which the peak is computed, relative to the greatest velocity
+of the earlier samples."""
+PEAK_BISECTIONS = 6
+"""Number of bisection steps after which the error of a peak of the velocity is below a thousandth."""
 SAMPLES_PER_PIECE = 4
 """Number of samples in every piece of a path."""
 
@@ -179,6 +184,38 @@ def _find_turn_beyond_limit(
 
 
 @compiled()
+def _measure_peaks(
+    problem: PathProblem, last: float, time: float, near: Array, motion: Array, sliders: Array, worst: Array
+) -> None:
+    """Update the greatest velocities `worst` (6, 3) where a velocity has a peak between two samples.
+
+    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the samples at `last` and `time`, and space for a third sample. Only
+    the coordinates of the path are measured: if it moves another point, x and y of the centre are not among them.
+    """
+    for i in range(2 if len(problem.tools) else 0, 6):
+        of_slider, n = i >= 3, i % 3
+        states = sliders if of_slider else motion
+        row, weight = (0, problem.shares[0, n]) if of_slider else (1 + n, 1.0)
+        begin, end = states[0, 2, n], states[1, 2, n]
+        if begin * end >= 0.0:
+            continue
+        # With constant jerk, the velocity would rise by half of this value.
+        rise = begin * begin / abs(begin - end) * (time - last)
+        if weight * (abs(states[0, 1, n]) + rise) <= worst[row, 0] * MIN_PEAK:
+            continue
+        low, high = last, time
+        for _ in range(PEAK_BISECTIONS):
+            middle = (low + high) / 2.0
+            if not _solve_at(problem, middle, near, motion[2], sliders[2]):
+                return
+            worst[row, 0] = max(worst[row, 0], weight * abs(states[2, 1, n]))
+            if states[2, 2, n] * begin > 0.0:
+                low = middle
+            else:
+                high = middle
+
+
+@compiled()
 def _measure_rates(
     now: Array,
     then: Array,
@@ -246,6 +283,7 @@ def _sample_path(
             leaves_at = _find_turn_beyond_limit(problem, last, time, near, motion, sliders)
             if not math.isnan(leaves_at):
                 return last, leaves_at
+            _measure_peaks(problem, last, time, near, motion, sliders, worst)
         if time >= 0.0:
             _narrow_reach(problem, motion[1], sliders[1])
         last = time + step
