@@ -47,8 +47,8 @@ def open_regular(path: Path) -> BinaryIO:
     return file
 
 
-def text(path: Path) -> str:
-    """Return the content of a UTF-8 text file. Raises FileError."""
+def text(path: Path, errors: str = "strict") -> str:
+    """Return the content of a UTF-8 text file. Raises FileError. `errors` is that of bytes.decode."""
     with open_regular(path) as file:
         try:
             content = file.read(LARGEST_TEXT + 1)
@@ -57,7 +57,7 @@ def text(path: Path) -> str:
     if len(content) > LARGEST_TEXT:
         raise FileError(f"{path}: larger than {LARGEST_TEXT // 1_000_000} MB")
     try:
-        return content.decode("utf-8-sig")
+        return content.decode("utf-8-sig", errors)
     except UnicodeDecodeError as error:
         raise FileError(f"{path}: not text in UTF-8: {error.reason} at byte {error.start}") from error
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import re
 import string
@@ -248,6 +249,18 @@ def test_what_is_no_file_of_parameters_is_refused(tmp_path: Path, old: str, new:
     path.write_text(text.replace(old, new))
     with pytest.raises(DriveError, match=f"(?s)a.dcf is not a parameter file of a drive.*{said}"):
         parameter_file.read(path)
+
+
+@pytest.mark.parametrize("name", ["a.dcf", "a.eds", "a.toml"])
+@pytest.mark.parametrize(
+    ("made", "said"), [(lambda path: None, "No such file"), (Path.mkdir, "a folder"), (os.mkfifo, "a FIFO")]
+)
+def test_a_file_that_cannot_be_read_is_named(
+    name: str, made: Callable[[Path], None], said: str, tmp_path: Path
+) -> None:
+    made(tmp_path / name)
+    with pytest.raises(FileError, match=f"{name}: {said}"):
+        parameter_file.read(tmp_path / name)
 
 
 def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
