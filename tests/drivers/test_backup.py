@@ -233,6 +233,8 @@ def test_a_file_has_every_value_to_the_last_bit(
         ("NodeID=1", "NodeID=first", "first"),
         ("[6065]", "[6065", "already exists"),
         ("[6065]", "[6066]", "section '6066' already exists"),
+        ("[6065]", "[605a]", "section '605A' already exists"),
+        ("[6099sub2]", "[6099Sub1]", "section '6099SUB1' already exists"),
         ("ParameterValue=4294967295", "ParameterValue=4294967296", "object 6065:00: 4294967296 is not a value"),
         ("ParameterValue=4294967295", "ParameterValue=-1", "object 6065:00: -1 is not a value"),
         ("ParameterValue=4294967295", "ParameterValue=1.5", "object 6065:00: '1.5' is not a value"),

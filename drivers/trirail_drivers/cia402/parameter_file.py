@@ -207,7 +207,8 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
     sections.optionxform = lambda optionstr: _KEYWORDS.get(optionstr.lower(), optionstr)  # type: ignore[method-assign]
     # Unlike an EDS, a DCF with duplicates is refused: nobody can know which of two values to write into a drive.
     strict = configparser.RawConfigParser(allow_no_value=True)
-    strict.read_string(files.text(path, errors="replace").rstrip("\x1a\0 \r\n\t"))
+    # In capital letters, because hexadecimal numbers in the names of sections may have letters of either case.
+    strict.read_string(files.text(path, errors="replace").rstrip("\x1a\0 \r\n\t").upper())
     with eds.open_text(path) as text:
         sections.read_file(text)
     commissioned: dict[str, int] = {}
