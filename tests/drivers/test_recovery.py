@@ -159,6 +159,18 @@ def test_reset_is_refused_with_drive_and_progress(rig: RecoveryRig) -> None:
     ]
 
 
+@either
+@pytest.mark.parametrize("away", [(1,), (0, 1, 2)], ids=["one", "all"])
+def test_drives_return_to_a_slow_machine(away: tuple[int, ...], rig: RecoveryRig) -> None:
+    """Every cycle is late, so that many frames of a drive arrive between two steps of its set-up."""
+    holding(rig)
+    rig.cut(*away)
+    rig.cycles(20)
+    rig.supply(*away)
+    rig.driver._duration = lambda _: 2.0 * rig.config.period  # type: ignore[attr-defined]
+    rig.until(rig.ready, 3 * ENDS)
+
+
 def test_no_set_up_is_sent_while_another_drive_has_power(rig: RecoveryRig) -> None:
     """It has until stop_timeout to stop; where it keeps its power, nothing is configured, and reset says why."""
     holding(rig)

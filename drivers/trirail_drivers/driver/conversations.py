@@ -22,7 +22,7 @@ _FIRST_PAUSE, _MAX_PAUSE = 0.001, 0.02
 """
 
 MAX_QUEUED_FRAMES: Final = 8
-"""Maximum number of frames that a background conversation queues. The conversation awaits one frame at a time."""
+"""Maximum number of frames that a background conversation queues: the awaited frame and those that follow it."""
 
 T = TypeVar("T")
 
@@ -87,31 +87,36 @@ class BackgroundConversation(Generic[T]):
 
     def __init__(self, conversation: Coroutine[Any, Any, T]) -> None:
         self._conversation = conversation
-        self._heard: deque[can.Message] = deque(maxlen=MAX_QUEUED_FRAMES)
+        self._heard: deque[can.Message] = deque()
+        """Frames for the next steps. The first one is awaited; the conversation has not seen those that follow it."""
         self._wait: Wait | None = None
 
     def receive(self, frame: can.Message) -> None:
-        """Queue a frame for the next step."""
-        self._heard.append(frame)
+        """Queue a frame for the next step if the conversation awaits it.
+
+        Other frames are not queued, since a drive may send any number of them between two steps.
+        """
+        awaited = self._wait is not None and (self._heard or self._wait.accepts(frame))
+        if awaited and len(self._heard) < MAX_QUEUED_FRAMES:
+            self._heard.append(frame)
 
     def step(self, now: float) -> T | DriveError | None:
         """Continue if the awaited frame has arrived or its deadline has passed.
 
         Return the result or the error if the conversation has ended, otherwise None. `now` is the present time [s].
         """
-        frame = None
-        if self._wait is not None:
-            while self._heard and frame is None:
-                heard = self._heard.popleft()
-                frame = heard if self._wait.accepts(heard) else None
-            if frame is None and now < self._wait.deadline:
-                return None
+        if self._wait is not None and not self._heard and now < self._wait.deadline:
+            return None
+        frame = self._heard.popleft() if self._heard else None
         try:
             self._wait = self._conversation.send(frame)
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]
         except DriveError as error:
             return error
+        followed, self._heard = self._heard, deque()
+        for each in followed:
+            self.receive(each)
         return None
 
     def close(self) -> None:
