@@ -403,15 +403,21 @@ def test_a_bus_that_has_opened_and_was_not_taken_is_closed_at_the_end(rig: BusRi
 
 
 def test_without_room_for_a_thread_the_attempt_has_failed_and_another_follows() -> None:
-    bus = AbsentBus("can0", "")
+    """The lost bus is closed then, before another is opened: most adapters can be opened only once."""
+    lost, bus = AbsentBus("can0"), AbsentBus("can0")
     full = [True]
+
+    def opened() -> can.BusABC:
+        assert lost._is_shutdown
+        return bus
 
     def start(work: Callable[[], None]) -> None:
         if full.pop():
             raise RuntimeError("can't start new thread")
         work()
 
-    reopening = Reopening("can0", lambda: bus, start)
+    reopening = Reopening("can0", opened, start)
+    reopening.retire(lost)
     assert reopening.attempt(0.0) is None
     full.append(False)
     assert reopening.attempt(0.1) == "can't start new thread"

@@ -7,7 +7,6 @@ import math
 import os
 import threading
 from collections.abc import Callable
-from functools import partial
 from typing import Final
 
 import can
@@ -81,9 +80,8 @@ class Reopening:
             return outcome
         if now >= self._due:
             self._under_way = True
-            retired, self._retired = self._retired, None
             try:
-                self._start(partial(self._attempt, retired))
+                self._start(self._attempt)
             except RuntimeError as error:  # the system's limit on threads is reached
                 self._retired, self._outcome = retired, str(error)
         return None
@@ -95,7 +93,8 @@ class Reopening:
             if isinstance(bus, can.BusABC):
                 _shut_down(bus)
 
-    def _attempt(self, retired: can.BusABC | None) -> None:
+    def _attempt(self) -> None:
+        retired, self._retired = self._retired, None
         if retired is not None:  # also in a thread, since closing an adapter may block
             _shut_down(retired)
         try:
