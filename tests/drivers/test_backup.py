@@ -253,6 +253,18 @@ def test_what_is_no_file_of_parameters_is_refused(tmp_path: Path, old: str, new:
         parameter_file.read(path)
 
 
+@pytest.mark.generated(*range(8))
+def test_a_file_that_was_cut_off_is_refused(seed: int, tmp_path: Path) -> None:
+    """Its last value has lost digits."""
+    path = tmp_path / "a.dcf"
+    parameter_file.write(path, own())
+    text = path.read_text()
+    cuts = [found.end() for found in re.finditer("ParameterValue=.", text) if "[1005]" in text[: found.start()]]
+    path.write_text(text[: random.Random(seed).choice(cuts)])
+    with pytest.raises(DriveError, match=r"a.dcf .*: it lists object \w{4} but does not describe it"):
+        parameter_file.read(path)
+
+
 @pytest.mark.parametrize("name", ["a.dcf", "a.eds", "a.toml"])
 @pytest.mark.parametrize(
     ("made", "said"), [(lambda path: None, "No such file"), (Path.mkdir, "a folder"), (os.mkfifo, "a FIFO")]

@@ -37,6 +37,8 @@ IDENTITY: Final[Mapping[str, Key]] = {
 _UNUSED: Final = re.compile("FileInfo|Comments|DummyUsage|DeviceComm?issioning", re.IGNORECASE)
 """Names of sections that describe no object; canopen refuses some of these sections in files from other programs."""
 _KEYWORDS: Final = {each.lower(): each for each in ("ParameterValue", "NodeID", "LSS_SerialNumber")}
+_LISTS: Final = "MandatoryObjects", "OptionalObjects", "ManufacturerObjects"
+"""Sections that list the objects of a file."""
 _COMPACT: Final = re.compile("([0-9a-f]{4})value", re.IGNORECASE)
 _TOML_TYPES: Final = {
     f"{'i' if each in SIGNED_TYPES else 'u'}{8 * ODVariable.STRUCT_TYPES[each].size}": each for each in INTEGER_TYPES
@@ -181,6 +183,10 @@ def _read_dcf(path: Path, node: int | None) -> SavedParameters:
     texts = {key: raw for key, each in variables(objects) if (raw := getattr(each, "value_raw", None))}
     if len(texts) != sum("ParameterValue" in section for section in sections.values()) or not texts:
         raise ValueError("a ParameterValue belongs to no object" if texts else "no object has a ParameterValue")
+    lists = [sections[name] for name in _LISTS if name in sections]
+    listed = {int(each[number], 0) for each in lists for number in filter(str.isdigit, each)}
+    if cut_off := sorted(listed - set(objects)):
+        raise ValueError(f"it lists object {cut_off[0]:04X} but does not describe it; is the file complete?")
     info = objects.device_information
     numbers |= {"vendor": info.vendor_number, "product": info.product_number, "revision": info.revision_number}
     for name, key in IDENTITY.items():
