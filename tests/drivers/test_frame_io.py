@@ -15,9 +15,10 @@ from carriers import over
 from hypothesis import given
 from hypothesis import strategies as st
 from rigs import frame
+from trirail_drivers.bus import own_frames
 from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED, ERROR, EXTENDED, REMOTE
-from trirail_drivers.bus.capture import Capture
-from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames
+from trirail_drivers.bus.capture import Capture, CapturedBus
+from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames, frame_io
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.own_frames import OwnFrames
 from trirail_drivers.bus.wire import Wire
@@ -263,3 +264,18 @@ def test_what_this_end_has_sent_has_not_arrived(marked: bool) -> None:
         bus.arrived.append(frame(0x080))  # theirs
         del bus.arrived[1]  # our first one
         assert arriving(frames, 2) == [(0x181, b"\1"), (0x080, b"")]
+
+
+@pytest.mark.parametrize("marked", [True, False])
+def test_what_this_end_has_sent_is_captured_once(marked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not marked:
+        monkeypatch.setattr(own_frames, "UdpMulticastBus", EchoingBus)
+    capture = Capture()
+    with EchoingBus(marked=marked) as bus, CapturedBus(bus, capture) as captured:
+        frames = frame_io(captured)
+        for identifier in (0x201, 0x080):
+            frames.send(Frame(identifier))
+            bus.arrived.append(frame(identifier + 1))
+        arriving(frames, 2)
+        bodies = [body for chunk in capture.drain() for _, body in CAPTURED.iter_unpack(chunk)]
+    assert [CAN_FRAME.unpack(body)[0] for body in bodies] == [0x201, 0x080, 0x202, 0x081]

@@ -9,6 +9,7 @@ import can
 
 from trirail_drivers.bus.can_frame import CAPTURED
 from trirail_drivers.bus.frames import fd_message, is_fd, packed
+from trirail_drivers.bus.own_frames import OwnFrames
 
 CHUNK_FRAMES = 1024
 """Maximum number of frames in a chunk."""
@@ -43,18 +44,20 @@ class CapturedBus(can.BusABC):
         self.capture = capture
         """Buffer of the captured frames."""
         self.channel_info = f"{bus.channel_info}, captured"
+        self._own = OwnFrames(bus)
         self._can_protocol = bus.protocol
         super().__init__(channel=self.channel_info)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send and capture a frame."""
         self.inner.send(msg, timeout)
+        self._own.note(msg)
         self.capture.note(packed(fd_message(msg) if is_fd(self.inner) else msg), time.time())
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Receive and capture a frame."""
+        """Receive a frame, and capture it unless it is a frame of this end, which has already been captured."""
         frame = self.inner.recv(timeout)
-        if frame is not None:
+        if frame is not None and not self._own.include(frame):
             self.capture.note(packed(frame), time.time())
         return frame
 
