@@ -83,7 +83,7 @@ class Reopening:
             try:
                 self._start(self._attempt)
             except RuntimeError as error:  # the system's limit on threads is reached
-                self._retired, self._outcome = retired, str(error)
+                self._outcome = str(error)
         return None
 
     def close(self) -> None:
