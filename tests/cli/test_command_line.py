@@ -197,6 +197,7 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         ),
         ("stop --connect tcp/127.0.0.1", 1, "the port is missing: an endpoint is protocol/address"),
         ("stop --connect tcp/no..name:1", 1, "invalid host name; start trirail run or zenohd there"),
+        ("stop --connect tcp/127.0.0.1", 1, "no service at tcp/127.0.0.1: the port is missing"),
     ],
 )
 def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code: int, said: str, run: Run) -> None:

@@ -19,6 +19,7 @@ from trirail.wire.endpoints import (
     socket_file,
     tcp_address,
 )
+from trirail.wire.stop_protocol import stop_address
 
 ENDS = ("", "#iface=eth0", "?rel=1", "?rel=1#so_sndbuf=65000")
 
@@ -97,6 +98,9 @@ def test_what_an_endpoint_lacks_is_said(host: str, port: int, protocol: str, end
     assert fault_of(f"{protocol}/{end}").startswith("the address is missing")
     for wrong in ("", "0", str(port + 65535), f"-{port}", "x", "\u0665"):
         assert fault_of(f"{protocol}/{host}:{wrong}{end}").startswith("the port must be 1 to 65535")
+        assert tcp_address(f"{protocol}/{host}:{wrong}{end}") is None
+    for faulty in (f"{protocol}/{host}{end}", f"{protocol}/:{port}{end}", f"{protocol}/{end}"):
+        assert tcp_address(faulty) is stop_address(faulty) is None
     assert tcp_address(f"{protocol}/{host}:{port}{end}") == (
         None if protocol in ("udp", "quic") else (host.strip("[]"), port)
     )

@@ -49,10 +49,12 @@ def fault_of(endpoint: str) -> str:
 
 
 def tcp_address(endpoint: str) -> tuple[str, int] | None:
-    """Return the host and port of an endpoint; None if the endpoint's protocol does not use TCP."""
+    """Return the host and port of an endpoint; None if it is invalid, or if its protocol does not use TCP."""
     protocol, address = _parts(endpoint)
+    if protocol not in {"tcp", "tls", "ws"} or fault_of(endpoint):
+        return None
     host, _, port = address.rpartition(":")
-    return (host.strip("[]"), int(port)) if protocol in {"tcp", "tls", "ws"} else None
+    return host.strip("[]"), int(port)
 
 
 def is_host(text: str) -> bool:
