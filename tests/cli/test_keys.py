@@ -19,6 +19,7 @@ from trirail.errors import ServiceError
 from trirail.processes.session_guard import Guard
 from trirail.wire.certificates import Pair, issue
 from trirail.wire.credentials import Credentials, revoked
+from trirail.wire.sizes import MAX_NAME
 from trirail.wire.vocabulary import Role
 
 
@@ -42,6 +43,15 @@ def test_robot_and_user_get_what_they_need(here: Path, capsys: pytest.CaptureFix
     assert {"192.0.2.7", "robot.example.org", "127.0.0.1", "localhost"} <= set(robot.addresses)
     assert (ann.name, ann.addresses) == ("ann", ())
     assert abs(ann.expires - datetime.now(UTC) - timedelta(days=90)) < timedelta(minutes=1)
+
+
+@pytest.mark.parametrize("length", [1, 54, 55, MAX_NAME])
+def test_every_name_of_a_robot_is_good_for_certificates(here: Path, length: int) -> None:
+    name = "r" * length
+    assert keys("init", "--robot", name) == 0
+    assert keys("robot", "x" * length) == 0
+    assert keys("add", "u" * length, "--role", "viewer") == 0
+    assert Credentials.read(here / "keys").name == name
 
 
 def test_openssl_finds_each_good_for_its_purpose_and_no_other(here: Path) -> None:

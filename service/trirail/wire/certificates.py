@@ -18,6 +18,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 AUTHORITY_DAYS = 3650
 """Validity of an authority's certificate [days]."""
+LONGEST_ROBOT = 54
+"""Maximum number of characters of the robot's name in that of its authority, since X.509 allows common names of 64."""
 CLOCK_TOLERANCE = timedelta(minutes=10)
 """Time by which the validity of a certificate begins before its creation, because the clocks of machines differ."""
 
@@ -32,7 +34,7 @@ class Pair(NamedTuple):
 def authority(robot: str, now: datetime | None = None) -> Pair:
     """Return a new authority, which consists of a self-signed certificate and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = _name(f"{robot} authority")
+    name = _name(f"{robot[:LONGEST_ROBOT]} authority")
     builder = (
         _builder(name, key.public_key(), now or datetime.now(UTC), AUTHORITY_DAYS)
         .issuer_name(name)
