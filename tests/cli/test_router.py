@@ -366,6 +366,22 @@ def test_a_robot_or_router_that_is_revoked_is_not_let_in(net: Net, tmp_path: Pat
         pass
 
 
+def test_neither_a_robot_nor_a_router_obeys_a_router_that_is_revoked(net: Net, tmp_path: Path) -> None:
+    """Who has its certificate would send goals to the robot in the name of every user."""
+    keys = KeyFolder(shutil.copytree(net.folder / "keys", tmp_path / "keys"))
+    keys.revoke("north")
+    own = Path(shutil.copytree(keys.folder, tmp_path / "own"))
+    for name in ("cert.pem", "key.pem"):
+        shutil.copy(user(tmp_path, "demo") / name, own / name)
+    at = (f"tls/127.0.0.1:{free_port()}",)
+    table = Zenoh(listen=at, connect=(net.locator,), router="north", tls=Tls(str(own)), users=ROLES)
+    with pytest.raises(ServiceError, match=r"north: revoked, but still listed in zenoh\.router"):
+        Guard(msgspec.structs.replace(CONFIG, zenoh=table))
+    with pytest.raises(ServiceError, match="north: revoked, but still listed in robots, routers or"):
+        router.settings(RouterConfig(table, ("far",)))
+    Guard(msgspec.structs.replace(CONFIG, zenoh=msgspec.structs.replace(table, router="hub")))
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [

@@ -15,7 +15,7 @@ from trirail.config import UserName, Zenoh, check_reach, toml_tables, wrong_valu
 from trirail.errors import ConfigError, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.access import router_access_control
-from trirail.wire.credentials import Credentials, revoked, with_role
+from trirail.wire.credentials import Credentials, check_not_revoked, with_role
 from trirail.wire.decoding import converted, prepare
 
 
@@ -81,12 +81,8 @@ def settings(config: RouterConfig) -> dict[str, Any]:
     if config.zenoh.tls is None:
         return zenoh_session.router(listen, None, None, connect, thinned)
     folder = Path(config.zenoh.tls.directory)
-    if gone := sorted(revoked(folder) & config.behind.keys()):
-        raise ServiceError(
-            f"{', '.join(gone)}: revoked, but still listed in robots or routers, so the lost certificate would be "
-            "accepted: remove the name from the list; if the machine is still in use, create a certificate with a new "
-            "name for it"
-        )
+    peers = [*config.behind, *([config.zenoh.router] if config.zenoh.router is not None else [])]
+    check_not_revoked(peers, "robots, routers or zenoh.router", folder)
     own = Credentials.read_server(folder)
     if own.name in (*config.behind, *config.all_robots):
         raise ServiceError(

@@ -44,7 +44,7 @@ class Guard:
         self._without_stop_port: list[str] = []
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
-            admission = admission or Admission.read(folder, config.zenoh.users)
+            admission = admission or Admission.read(folder, config.zenoh.users, self._router)
             self._credentials = admission.credentials.in_memory()
             if self._connect and self._credentials.name != self._robot:
                 raise ServiceError(

@@ -365,10 +365,10 @@ class Supervisor:
 def _admission(config: Config) -> Admission | None:
     """Read the credentials of [zenoh.tls], if it is set. They are read once for all starts of the gateway.
 
-    Raises ServiceError if the credentials are invalid.
+    Raises ServiceError if the credentials are invalid, or if [zenoh] router is revoked.
     """
     zenoh = config.zenoh
-    return Admission.read(Path(zenoh.tls.directory), zenoh.users) if zenoh.tls is not None else None
+    return Admission.read(Path(zenoh.tls.directory), zenoh.users, zenoh.router) if zenoh.tls is not None else None
 
 
 @contextmanager

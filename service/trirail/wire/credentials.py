@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -121,11 +121,13 @@ class Admission(NamedTuple):
     """Roles of the users, without users that have been revoked."""
 
     @classmethod
-    def read(cls, folder: Path, users: Mapping[str, Role]) -> Self:
+    def read(cls, folder: Path, users: Mapping[str, Role], router: str | None = None) -> Self:
         """Read the credentials in a robot's folder, and remove the revoked users from `users`.
 
-        Raises ServiceError if the credentials are unusable, or if the list of revoked users cannot be read.
+        Raises ServiceError if the credentials are unusable, if the list of revoked users cannot be read, or if the
+        robot's `router` is revoked.
         """
+        check_not_revoked([router] if router is not None else [], "zenoh.router", folder)
         return cls(Credentials.read_server(folder), with_role(users, folder))
 
 
@@ -146,6 +148,18 @@ def revoked(folder: Path) -> frozenset[str]:
     """
     file = folder / REVOKED
     return frozenset(_content(file).decode().split()) if file.exists() else frozenset()
+
+
+def check_not_revoked(names: Collection[str], listed_in: str, folder: Path) -> None:
+    """Raise ServiceError if one of these names of robots and routers is revoked.
+
+    `listed_in` tells the error message which settings contain the names.
+    """
+    if gone := sorted(revoked(folder) & set(names)):
+        raise ServiceError(
+            f"{', '.join(gone)}: revoked, but still listed in {listed_in}, so the lost certificate would be accepted: "
+            "remove the name; if the machine is still in use, create a certificate with a new name for it"
+        )
 
 
 def with_role(users: Mapping[str, Role], folder: Path) -> dict[str, Role]:
