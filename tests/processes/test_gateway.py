@@ -10,6 +10,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 import zenoh
 from control_rig import CONFIG, carried
@@ -21,8 +23,10 @@ from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOAL
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.event_codes import EventCode
+from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
+from trirail.wire.kinds.trajectory import parts
 from trirail.wire.links import LinkClosed
-from trirail.wire.messages import Event, GoalReply, Notice
+from trirail.wire.messages import CommandReply, Event, GoalReply, Notice
 from trirail.wire.packets import (
     Accepted,
     Announcement,
@@ -32,12 +36,15 @@ from trirail.wire.packets import (
     EventReport,
     Farewell,
     GoalRequest,
+    Refused,
     Request,
     Status,
     Welcome,
 )
+from trirail.wire.records import DTYPE
+from trirail.wire.sizes import MAX_PART
 from trirail.wire.state import Info
-from trirail.wire.vocabulary import AcquireLease, Command, Role
+from trirail.wire.vocabulary import AcquireLease, Command, Mode, Role
 from trirail_drivers.interface import MissingProtection
 
 
@@ -208,6 +215,23 @@ def test_a_stop_that_overtook_goals_withdraws_them_and_none_that_came_later(rig:
     for number, user in ((3, "ann"), (4, "bob"), (6, "ann"), (7, "eve")):
         rig.goal(f"g{number}", user, number)
     assert rig.goals() == [("g3", "stop by ann"), ("g4", "stop by ann"), ("g6", None), ("g7", None)]
+
+
+@pytest.mark.parametrize("content", [b"", b'{"goal": "g"}'])
+def test_a_stop_that_overtook_a_part_of_a_trajectory_withdraws_the_whole(rig: Rig, content: bytes) -> None:
+    points = tuple(TrajectoryPoint(0.1 * n, 0.0, 0.0, 0.0) for n in range(MAX_PART + 1))
+    first, last = map(msgspec.json.encode, parts(TrajectoryGoal(points, "g")))
+    rig.gateway._handle(came("goal", "trirail/demo/goal/ann", first, 1))
+    answers: list[object] = []
+    stop = came("cmd", "trirail/demo/cmd/ann/stop", content, 2)
+    rig.gateway._handle(stop._replace(at_door=answers.append))
+    (sent,) = rig.commands()
+    no = Refused(sent.ticket, RefusalCode.NO_GOAL, "not in progress")
+    rig.gateway._states.records(np.zeros(1, DTYPE))
+    rig.hear(no if content else CommandDone(sent.ticket, Command.STOP, Mode.HOLDING, 0))
+    assert [type(answer) for answer in answers] == [CommandReply]
+    rig.gateway._handle(came("goal", "trirail/demo/goal/ann", last, 3))
+    assert rig.goals() == [("g", "stop by ann")]
 
 
 def test_what_waits_for_the_loop_does_not_begin_under_anothers_lease(rig: Rig) -> None:

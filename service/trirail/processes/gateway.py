@@ -108,7 +108,9 @@ class Gateway:
         self._looks = Looks(self._announce)
         self._parts = TrajectoryParts(self._refusals.refuse)
         self._requests = Requests(config, link, guard, self._replies, self._loop_death, urgent_section)
-        self._commands = CommandReader(self._requests, self._replies, self._states, self._inbox, self._refusals.refuse)
+        self._commands = CommandReader(
+            self._requests, self._replies, self._states, self._inbox, self._parts, self._refusals.refuse
+        )
         connect = config.zenoh.connect
         self._routers = RouterLinks(connect, partial(guard.linked, session), guard.why_not_linked, self._announce)
         known = {*guard.users, config.zenoh.router or ""}

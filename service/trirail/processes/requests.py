@@ -24,6 +24,7 @@ from trirail.processes.loop_death import LoopDeath
 from trirail.processes.publications import StateMaker
 from trirail.processes.replies import Replies
 from trirail.processes.session_guard import Guard
+from trirail.processes.trajectory_parts import TrajectoryParts
 from trirail.wire import boundary
 from trirail.wire.goals import Goal, LoopGoal
 from trirail.wire.links import PacketLink
@@ -199,15 +200,17 @@ class CommandReader:
         replies: Replies,
         states: StateMaker,
         inbox: Inbox,
+        parts: TrajectoryParts,
         refuse: Callable[[Incoming, RefusedError], None],
     ) -> None:
         self._requests = requests
         self._replies = replies
         self._states = states
         self._inbox = inbox
+        self._parts = parts
         self._refuse = refuse
         self._of_unread: set[int] = set()
-        """Tickets of stops that apply to a single goal, if that goal may be in a message that has not been read yet."""
+        """Tickets of stops that apply to a single goal, if that goal or a part of it may not have been read yet."""
 
     def read(self, incoming: Incoming, user: str, command: str) -> None:
         """Carry out a command, unless it is a copy of an earlier one. Raises RefusedError for an unknown command."""
@@ -260,7 +263,7 @@ class CommandReader:
             self._replies.answer(incoming, self._stopped())
             return
         ticket = self._requests.command(incoming, user, name, content)
-        if goal is not None and self._inbox.earlier(incoming.number):
+        if goal is not None and (self._inbox.earlier(incoming.number) or self._parts.is_incomplete(goal)):
             self._of_unread.add(ticket)
             backlog.withdraw_coming(goal, reason, incoming.number)
         if name.stops and goal is None and (name.ignores_lease or self._states.lease in (None, user)):

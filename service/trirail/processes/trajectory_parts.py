@@ -71,6 +71,10 @@ class TrajectoryParts:
         """Yield the messages that have not been answered."""
         return (goal.message for goal in self._incomplete.values())
 
+    def is_incomplete(self, goal_id: str) -> bool:
+        """Return True if some parts of the goal with this id have arrived, but not all."""
+        return any(goal_id == incomplete_id for _, incomplete_id in self._incomplete)
+
     def add(self, incoming: Incoming, user: str, goal: TrajectoryGoal) -> tuple[Incoming, PackedTrajectory] | None:
         """Add a part. If all parts have arrived, return the whole goal and its parts as one message, else None.
 
