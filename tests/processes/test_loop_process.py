@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import re
+import tempfile
 import tomllib
 from pathlib import Path
 
@@ -110,3 +111,13 @@ def test_a_robot_that_takes_minutes_to_stop_starts_and_lacks_what_was_not_rehear
     config = msgspec.structs.replace(config, limits=msgspec.structs.replace(config.limits, platform=platform))
     assert rehearse(config) == (f"rehearsed stops: the robot was still stopping after {STEP_WITHIN} cycles",)
     assert modes[-1] is Mode.STOPPING
+
+
+@pytest.mark.parametrize("folder", ["x" * 100, "none"])
+def test_where_no_sockets_can_be_made_the_robot_starts_and_lacks_what_was_not_rehearsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    (tmp_path / ("x" * 100)).mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / folder))
+    (lacking,) = rehearse(load(SIM))
+    assert lacking.startswith("rehearsed stops: ")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -342,3 +343,17 @@ def test_a_runtime_folder_of_somebody_else_is_refused_in_words(run: Running, mon
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(run.folder / "gone"))
     with pytest.raises(ServiceError, match=r"sockets in .*gone \(XDG_RUNTIME_DIR\): .*; unset XDG_RUNTIME_DIR, or set"):
         run.ends(1)
+
+
+@pytest.mark.parametrize("variable", ["XDG_RUNTIME_DIR", "TMPDIR"])
+def test_a_runtime_folder_whose_path_is_too_long_for_sockets_is_refused_in_words(
+    run: Running, monkeypatch: pytest.MonkeyPatch, variable: str
+) -> None:
+    deep = run.folder / ("x" * 100)
+    deep.mkdir()
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(deep))
+    monkeypatch.setenv(variable, str(deep))
+    with pytest.raises(ServiceError, match=r"cannot make sockets in .*: .*too long; set XDG_RUNTIME_DIR, or TMPDIR"):
+        run.ends(1)
+    assert not list(deep.iterdir())

@@ -190,11 +190,11 @@ def rehearse(config: Config) -> tuple[str, ...]:
     """Rehearse stops, faults and the end of the loop. If the rehearsal fails, return the reason, otherwise nothing."""
     each = {name: structs.replace(drive, homing=None) for name, drive in zip(NAMES, config.drives.each, strict=True)}
     config = structs.replace(config, drives=structs.replace(config.drives, **each))
-    with files.temporary_folder() as folder:
-        try:
+    try:
+        with files.temporary_folder() as folder:
             _Rehearsal(config, folder).run()
-        except (DriveError, _UnfinishedError) as error:
-            return (f"rehearsed stops: {error}",)
+    except (DriveError, OSError, _UnfinishedError) as error:
+        return (f"rehearsed stops: {error}",)
     return ()
 
 

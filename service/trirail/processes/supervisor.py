@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import selectors
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
@@ -136,7 +137,7 @@ class Supervisor:
         """
         raise_descriptor_limit()
         with _runtime_folder() as folder, Signals() as signals:
-            self._listening = [links.listen(folder / name) for name in PORTS]
+            self._listening = _listen(folder)
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
             sockets = [listening.fileno() for listening in self._listening]
             self._parent = ForkServerLink(self._order, folder, self._heartbeats, sockets)
@@ -386,6 +387,17 @@ def _runtime_folder() -> Iterator[Path]:
                 "this user"
             ) from error
         yield folder
+
+
+def _listen(folder: Path) -> list[socket.socket]:
+    """Listen on the sockets of the loop in a folder. Raises ServiceError if that is impossible."""
+    try:
+        return [links.listen(folder / name) for name in PORTS]
+    except OSError as error:  # usually because the kernel allows only 107 bytes for the path of a socket
+        raise ServiceError(
+            f"cannot make sockets in {folder}: {error.strerror or error}; "
+            "set XDG_RUNTIME_DIR, or TMPDIR if there is none, to another folder of this user with a short path"
+        ) from error
 
 
 def _metrics_server(config: Config, health: Health) -> AbstractContextManager[object]:

@@ -140,9 +140,13 @@ def connect(path: Path) -> PacketLink:
 
 
 def listen(path: Path) -> socket.socket:
-    """Return a listening socket for a port, to which peers can connect even before the loop runs."""
+    """Return a listening socket for a port, to which peers can connect even before the loop runs. Raises OSError."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    listening.bind(str(path))
+    try:
+        listening.bind(str(path))
+    except OSError:
+        listening.close()
+        raise
     listening.listen(1)
     return listening
 
