@@ -60,6 +60,8 @@ class Child:
         """Sockets on which the loop listens."""
         # The pipe stays open until the process ends. The closed pipe shows the supervisor that the process has ended.
         self._pipe = voice
+        self._unsent = b""
+        """Rest of a message that has been sent in part."""
 
     def report_ready(self, content: object) -> None:
         """Report to the supervisor that the process has started.
@@ -80,15 +82,27 @@ class Child:
 
     def log(self, event: Event) -> None:
         """Send an event to the supervisor for the log; drop the event if the pipe is full for LOG_WITHIN."""
-        if select.select([], [self._pipe], [], LOG_WITHIN)[1]:
-            self._send({HAPPENED: event})
+        self._send_within({HAPPENED: event}, LOG_WITHIN)
 
     def report_measurements(self, content: msgspec.Struct) -> None:
         """Send measurements to the supervisor; drop them if the pipe is full, because new ones follow in a second."""
-        line = msgspec.json.encode({MEASURED: content}) + b"\n"
-        if len(line) <= select.PIPE_BUF and select.select([], [self._pipe], [], 0.0)[1]:
-            with suppress(BrokenPipeError):
-                os.write(self._pipe, line)
+        self._send_within({MEASURED: content}, 0.0)
+
+    def _send_within(self, content: object, seconds: float) -> None:
+        """Send a message, which is dropped if the pipe is full for `seconds`. Before it, send the rest of another."""
+        self._unsent = self._send_part(self._unsent, seconds)
+        if not self._unsent:
+            line = msgspec.json.encode(content) + b"\n"
+            rest = self._send_part(line, seconds)
+            self._unsent = rest if len(rest) < len(line) else b""
+
+    def _send_part(self, line: bytes, seconds: float) -> bytes:
+        """Send as much of a line as the pipe takes, each part within `seconds`, and return the rest."""
+        with suppress(BrokenPipeError):
+            while line and select.select([], [self._pipe], [], seconds)[1]:
+                os.write(self._pipe, line[: select.PIPE_BUF])  # more would wait for space, pipe(7)
+                line = line[select.PIPE_BUF :]
+        return line
 
 
 def run(child: Child) -> int:
