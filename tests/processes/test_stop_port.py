@@ -19,7 +19,7 @@ from trirail.config import Config, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes import stop_port
 from trirail.processes.session_guard import Guard
-from trirail.processes.sockets import Reserve
+from trirail.processes.sockets import Reserve, listen
 from trirail.processes.stop_port import Answer
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials
@@ -306,6 +306,35 @@ def test_an_address_that_is_taken_is_told_with_the_remedy_and_the_service_goes_o
         door.close()
     guard.stop_port(lambda *_: None).close()
     assert not any("no stop port" in warning for warning in guard.warnings())
+
+
+ELSEWHERE = "192.0.2.1"
+
+
+@pytest.mark.parametrize(
+    ("addresses", "listened"),
+    [
+        (("127.0.0.1", ELSEWHERE), 1),
+        ((ELSEWHERE, "127.0.0.1", "127.0.0.1"), 1),
+        (("127.0.0.1", "127.0.0.2"), 2),
+        ((ELSEWHERE,), 0),
+    ],
+)
+def test_a_name_s_addresses_that_this_machine_does_not_have_keep_no_stop_out(
+    monkeypatch: pytest.MonkeyPatch, addresses: tuple[str, ...], listened: int
+) -> None:
+    def resolved(_: str, port: int, type: int) -> list[object]:  # noqa: A002 - the name that it has in socket
+        return [(socket.AF_INET, type, 6, "", (address, port)) for address in addresses]
+
+    monkeypatch.setattr(socket, "getaddrinfo", resolved)
+    address = StopAddress(("robot.example", service_port()), secured=False)
+    with contextlib.nullcontext() if listened else pytest.raises(OSError, match="requested address"):
+        opened = listen(address)
+        assert len(opened) == listened
+        with pytest.raises(OSError, match="already in use"):
+            listen(address)
+        for each in opened:
+            each.close()
 
 
 def test_a_port_that_the_configuration_needs_for_more_is_not_taken() -> None:

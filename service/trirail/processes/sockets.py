@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import ipaddress
 import os
 import resource
@@ -107,7 +108,7 @@ class Reserve:
 
 
 def listen(address: StopAddress) -> list[socket.socket]:
-    """Listen on a Unix socket, or on every address of a host name. Raises OSError on failure."""
+    """Listen on a Unix socket, or on every address of a host name that this machine has. Raises OSError on failure."""
     if isinstance(address.where, str):
         # A gateway that was killed may have left the socket. Zenoh's lock file shows that no other gateway is running.
         Path(address.where).unlink(missing_ok=True)
@@ -115,23 +116,36 @@ def listen(address: StopAddress) -> list[socket.socket]:
     else:
         host, port = address.where
         resolved = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        places = [(family, where) for family, _, _, _, where in resolved]
-    listening = []
-    try:
-        for family, where in places:
-            opened = socket.socket(family)
-            listening.append(opened)
-            opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            opened.bind(where)
-            if isinstance(where, str):
-                Path(where).chmod(SOCKET_MODE)
-            opened.listen(socket.SOMAXCONN)
-            opened.setblocking(False)
-    except OSError:
-        for opened in listening:
-            opened.close()
-        raise
+        places = list(dict.fromkeys((family, where) for family, _, _, _, where in resolved))  # hosts(5) may repeat one
+    listening: list[socket.socket] = []
+    for number, place in enumerate(places, 1):
+        try:
+            listening.append(_listen(*place))
+        except OSError as error:
+            if error.errno not in _ABSENT or (number == len(places) and not listening):
+                for opened in listening:
+                    opened.close()
+                raise
     return listening
+
+
+_ABSENT = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
+"""Errors for an address that this machine does not have, such as that of localhost in IPv6 on a machine without it."""
+
+
+def _listen(family: socket.AddressFamily, where: Any) -> socket.socket:
+    opened = socket.socket(family)
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        opened.bind(where)
+        if isinstance(where, str):
+            Path(where).chmod(SOCKET_MODE)
+        opened.listen(socket.SOMAXCONN)
+        opened.setblocking(False)
+    except OSError:
+        opened.close()
+        raise
+    return opened
 
 
 def source(connected: socket.socket, address: object) -> str:
