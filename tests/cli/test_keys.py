@@ -17,7 +17,7 @@ from trirail.cli.key_folder import KeyFolder
 from trirail.config import Tls, Zenoh
 from trirail.errors import ServiceError
 from trirail.processes.session_guard import Guard
-from trirail.wire.certificates import Pair, issue
+from trirail.wire.certificates import AUTHORITY_DAYS, Pair, authority, issue
 from trirail.wire.credentials import Credentials, revoked
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.vocabulary import Role
@@ -94,6 +94,31 @@ def test_renewing_keeps_the_key_and_the_addresses(here: Path) -> None:
         assert credentials.expires - datetime.now(UTC) > timedelta(days=299)
         assert credentials.warning() == ""
     assert "192.0.2.7" in Credentials.read(here / "keys").addresses
+
+
+@pytest.mark.parametrize("left", [-1, 20])
+def test_no_certificate_lives_longer_than_its_authority(
+    here: Path, capsys: pytest.CaptureFixture[str], left: int
+) -> None:
+    ends = datetime.now(UTC) + timedelta(days=left)
+    by = authority("demo", ends - timedelta(days=AUTHORITY_DAYS))
+    keys("init")
+    for name, content in (("ca.pem", by.certificate), ("ca-key.pem", by.key)):
+        (here / "keys" / name).write_bytes(content)
+    tried = (("renew", "demo", "--days", "100"), ("add", "ann", "--role", "viewer", "--days", "100"))
+    if left < 0:
+        for arguments in tried:
+            with pytest.raises(ServiceError, match=r"the authority expired on .*: create a new one in another folder"):
+                keys(*arguments)
+        return
+    for arguments in tried:
+        capsys.readouterr()
+        keys(*arguments)
+        assert f"valid until {ends:%Y-%m-%d}" in capsys.readouterr().out
+    capsys.readouterr()
+    keys("list", "--json")
+    shown = [each["expires"] for each in json.loads(capsys.readouterr().out)["certificates"]]
+    assert [each[:10] for each in shown] == [f"{ends:%Y-%m-%d}"] * 2
 
 
 def test_who_is_revoked_is_never_made_again(here: Path) -> None:

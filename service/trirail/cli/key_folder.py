@@ -125,6 +125,12 @@ class KeyFolder:
     def _authority(self) -> Pair:
         pair = Pair(_read(self.folder / AUTHORITY), _read(self.folder / AUTHORITY_KEY))
         check_private(self.folder / AUTHORITY_KEY)
+        expires = _certificate(self.folder / AUTHORITY).not_valid_after_utc
+        if expires < datetime.now(UTC):
+            raise ServiceError(
+                f"{self.folder / AUTHORITY}: the authority expired on {expires:%Y-%m-%d}: create a new one in another "
+                "folder with trirail keys init"
+            )
         return pair
 
 
@@ -132,13 +138,17 @@ def _issued(folder: Path, *, is_robot: bool) -> IssuedCertificate:
     file = folder / CERTIFICATE
     if not is_robot and not file.exists():
         return IssuedCertificate(folder.name, False, False, None, folder)
-    try:
-        certificate = x509.load_pem_x509_certificate(_read(file))
-    except ValueError as error:
-        raise ServiceError(f"{file}: not a certificate in PEM format") from error
+    certificate = _certificate(file)
     return IssuedCertificate(
         common_name(certificate), is_robot, serves(certificate), certificate.not_valid_after_utc, folder
     )
+
+
+def _certificate(file: Path) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(_read(file))
+    except ValueError as error:
+        raise ServiceError(f"{file}: not a certificate in PEM format") from error
 
 
 def _write_pair(folder: Path, pair: Pair) -> None:

@@ -62,7 +62,7 @@ def issue(
     name
         Common name of the certificate.
     days
-        Validity [days].
+        Validity [days], which ends with that of the authority at the latest.
     addresses
         Host names and IP addresses at which clients connect to a robot.
     serves
@@ -74,7 +74,7 @@ def issue(
 
 
 def renew(by: Pair, certificate: bytes, days: float, now: datetime | None = None) -> bytes:
-    """Return a copy of a certificate with the same key that is valid for `days` from now.
+    """Return a copy of a certificate with the same key that is valid for `days` from now, as with `issue`.
 
     Raises ValueError if the certificate is not a valid PEM certificate with an elliptic-curve key.
     """
@@ -109,14 +109,18 @@ def addresses_of(certificate: x509.Certificate) -> list[str]:
     return [*map(str, names.get_values_for_type(x509.IPAddress)), *names.get_values_for_type(x509.DNSName)]
 
 
-def _builder(subject: x509.Name, key: ec.EllipticCurvePublicKey, now: datetime, days: float) -> x509.CertificateBuilder:
+def _builder(
+    subject: x509.Name, key: ec.EllipticCurvePublicKey, now: datetime, days: float, latest: datetime | None = None
+) -> x509.CertificateBuilder:
+    """Return the builder of a certificate that is valid for `days` from `now`, but not after `latest`."""
+    expires = now + timedelta(days=days)
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .public_key(key)
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - CLOCK_TOLERANCE)
-        .not_valid_after(now + timedelta(days=days))
+        .not_valid_after(min(expires, latest or expires))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )
 
@@ -137,7 +141,7 @@ def _certificate(
     identifier = issuer.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if serves else [])]
     builder = (
-        _builder(_name(name), key, now or datetime.now(UTC), days)
+        _builder(_name(name), key, now or datetime.now(UTC), days, issuer.not_valid_after_utc)
         .issuer_name(issuer.subject)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(signs_certificates=False), critical=True)
