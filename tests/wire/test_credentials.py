@@ -9,7 +9,8 @@ import pytest
 from certificates import tls_config, user
 from trirail.cli.key_folder import AUTHORITY_KEY, KeyFolder
 from trirail.errors import ServiceError
-from trirail.wire.credentials import KEY, Credentials, check_private
+from trirail.wire.credentials import KEY, Credentials, check_private, revoked, with_role
+from trirail.wire.vocabulary import Role
 
 
 def test_a_key_is_its_owners_alone_and_roots_its_groups_to_read(tmp_path: Path) -> None:
@@ -39,3 +40,14 @@ def test_everybody_who_reads_one_looks_at_that(tmp_path: Path) -> None:
         with pytest.raises(ServiceError, match="lets other users read this private key"):
             read()
         file.chmod(0o600)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_a_list_of_the_revoked_that_is_not_understood_lets_nobody_in(tmp_path: Path, encoding: str) -> None:
+    """A program on another system may have written it."""
+    (tmp_path / "revoked.txt").write_bytes("ann\r\nbob\r\n".encode(encoding) + (b"\xe4" * (encoding == "latin-1")))
+    if encoding.startswith("utf-8"):
+        assert with_role({"ann": Role.OPERATOR, "eva": Role.VIEWER}, tmp_path) == {"eva": Role.VIEWER}
+    else:
+        with pytest.raises(ServiceError, match="not text in UTF-8"):
+            revoked(tmp_path)

@@ -9,6 +9,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple, Self
 
+from trirail_drivers import files
+from trirail_drivers.errors import FileError
+
 from trirail.errors import ServiceError
 from trirail.wire.endpoints import ReachableBy, reach
 from trirail.wire.vocabulary import Role
@@ -147,7 +150,10 @@ def revoked(folder: Path) -> frozenset[str]:
     The set is empty if the file does not exist. Raises ServiceError if the file exists but cannot be read.
     """
     file = folder / REVOKED
-    return frozenset(_content(file).decode().split()) if file.exists() else frozenset()
+    try:
+        return frozenset(files.text(file).split()) if file.exists() else frozenset()
+    except (FileError, OSError) as error:
+        raise ServiceError(f"{error}; this file lists the revoked users, one per line") from error
 
 
 def check_not_revoked(names: Collection[str], listed_in: str, folder: Path) -> None:
