@@ -217,6 +217,25 @@ def test_a_stop_that_overtook_goals_withdraws_them_and_none_that_came_later(rig:
     assert rig.goals() == [("g3", "stop by ann"), ("g4", "stop by ann"), ("g6", None), ("g7", None)]
 
 
+@pytest.mark.parametrize("under_way", [True, False])
+def test_a_stop_of_a_goal_that_waits_reaches_the_loop_which_may_have_another_of_its_id(
+    rig: Rig, under_way: bool
+) -> None:
+    rig.gateway._states.records(np.zeros(1, DTYPE))
+    for number, name in enumerate(["a", *"bcdefgh"[:MAX_GOALS_OF_USER], "a"]):
+        rig.goal(name, number=number)
+    answers: list[object] = []
+    stop = came("cmd", "trirail/demo/cmd/ann/stop", b'{"goal": "a"}', 100)
+    rig.gateway._handle(stop._replace(at_door=answers.append))
+    (sent,) = rig.commands()
+    no = Refused(sent.ticket, RefusalCode.NO_GOAL, "not in progress")
+    rig.hear(CommandDone(sent.ticket, Command.STOP, Mode.HOLDING, 0) if under_way else no)
+    assert [type(answer) for answer in answers] == [CommandReply]
+    for ticket in (1, 2):
+        rig.accepted(ticket)
+    assert rig.goals()[-1] == ("a", "stop by ann")
+
+
 @pytest.mark.parametrize("content", [b"", b'{"goal": "g"}'])
 def test_a_stop_that_overtook_a_part_of_a_trajectory_withdraws_the_whole(rig: Rig, content: bytes) -> None:
     points = tuple(TrajectoryPoint(0.1 * n, 0.0, 0.0, 0.0) for n in range(MAX_PART + 1))

@@ -52,6 +52,10 @@ class LoopDeath:
             case Farewell():
                 self._farewell = True
 
+    def is_open(self, goal_id: str) -> bool:
+        """Return True if a goal with this id has begun and has not ended."""
+        return goal_id in self._open
+
     def _record_begin(self, goal_id: str, user: str | None) -> None:
         if goal_id not in self._ended:  # the loop itself reports that it refuses an id that was used before
             self._open.setdefault(goal_id, user)

@@ -130,6 +130,13 @@ class Requests:
                 self._loop_death.follow(request)
                 self._pending[request.ticket] = _PendingRequest(incoming, time.monotonic() + REPLY_TIMEOUT_S)
 
+    def in_loop(self, goal_id: str) -> bool:
+        """Return True if a goal with this id has been sent to the loop and has not ended.
+
+        Another goal with this id may be waiting, if its sender has sent it again.
+        """
+        return self._loop_death.is_open(goal_id)
+
     # ------------------------------------------------------------------ commands
 
     def command(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> int:
@@ -210,7 +217,7 @@ class CommandReader:
         self._parts = parts
         self._refuse = refuse
         self._of_unread: set[int] = set()
-        """Tickets of stops that apply to a single goal, if that goal or a part of it may not have been read yet."""
+        """Tickets of stops that apply to a single goal, if that goal or a part of it has not been sent to the loop."""
 
     def read(self, incoming: Incoming, user: str, command: str) -> None:
         """Carry out a command, unless it is a copy of an earlier one. Raises RefusedError for an unknown command."""
@@ -259,11 +266,12 @@ class CommandReader:
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
         backlog = self._requests.backlog
-        if goal is not None and backlog.withdraw(goal, reason):  # the goal has not been sent to the loop
+        withdrawn = goal is not None and backlog.withdraw(goal, reason)
+        if goal is not None and withdrawn and not self._requests.in_loop(goal):
             self._replies.answer(incoming, self._stopped())
             return
         ticket = self._requests.command(incoming, user, name, content)
-        if goal is not None and (self._inbox.earlier(incoming.number) or self._parts.is_incomplete(goal)):
+        if goal is not None and (withdrawn or self._inbox.earlier(incoming.number) or self._parts.is_incomplete(goal)):
             self._of_unread.add(ticket)
             backlog.withdraw_coming(goal, reason, incoming.number)
         if name.stops and goal is None and (name.ignores_lease or self._states.lease in (None, user)):
