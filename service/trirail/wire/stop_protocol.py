@@ -14,7 +14,7 @@ from msgspec import Struct
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
 from trirail.wire.decoding import prepare
-from trirail.wire.endpoints import LAST_PORT, ReachableBy, fault_of, reach, socket_file, tcp_address
+from trirail.wire.endpoints import LAST_PORT, ReachableBy, reach, socket_file, tcp_address
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.vocabulary import Command
 
@@ -69,8 +69,6 @@ def stop_address(endpoint: str) -> StopAddress | None:
     The address is the endpoint's port plus PORT_OFFSET, or the file of the endpoint's socket with SUFFIX. Return None
     if the endpoint is invalid or its protocol is not tcp, tls or unixsock-stream.
     """
-    if fault_of(endpoint):
-        return None
     if (file := socket_file(endpoint)) is not None:
         return StopAddress(f"{file}{SUFFIX}", secured=False)
     address = tcp_address(endpoint)
