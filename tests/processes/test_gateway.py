@@ -25,7 +25,7 @@ from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.event_codes import EventCode
 from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 from trirail.wire.kinds.trajectory import parts
-from trirail.wire.links import LinkClosed
+from trirail.wire.links import LinkClosed, PacketLink
 from trirail.wire.messages import CommandReply, Event, GoalReply, Notice
 from trirail.wire.packets import (
     Accepted,
@@ -410,6 +410,8 @@ class EndedLoop(FakeLink):
     def fileno(self) -> int:
         return 0
 
+    packets = PacketLink.packets
+
 
 def test_what_the_loop_said_before_it_ended_is_heard_though_it_takes_nothing_any_more(tmp_path: Path) -> None:
     """Else a loop that ended as it should would be told to have died."""
@@ -421,3 +423,27 @@ def test_what_the_loop_said_before_it_ended_is_heard_though_it_takes_nothing_any
         gateway = Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG), told.append)  # type: ignore[arg-type]
         gateway.serve(lambda: None)
     assert told == []
+
+
+class BusyLoop(EndedLoop):
+    """A loop that always has something more to say, up to 1000 packets, and takes everything."""
+
+    def send(self, packet: bytes) -> bool:
+        return FakeLink.send(self, packet)
+
+
+def test_a_loop_that_always_has_more_to_say_keeps_nobody_from_stopping_it(tmp_path: Path) -> None:
+    accepted = packets.message(Accepted(1, GoalReply("g", 1.0)))
+    with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
+        link = BusyLoop(*[accepted] * 1000)
+        gateway = Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG))  # type: ignore[arg-type]
+
+        def said(_packet: bytes, _ready: object) -> None:
+            if len(link._said) == 999:  # by now, whatever had arrived before has been handled
+                gateway._inbox._put(came("cmd", "trirail/demo/cmd/ann/stop", b""))
+            if len(link._said) == 500:
+                assert any(isinstance(request, CommandRequest) for request in link.sent)
+
+        gateway._handle_packet = said  # type: ignore[assignment,method-assign]
+        gateway.serve(lambda: None)
+    assert not link._said

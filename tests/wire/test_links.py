@@ -90,3 +90,17 @@ def test_the_peer_sees_the_end(port: Port, path: Path) -> None:
 def test_nobody_listens(path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         links.connect(path)
+
+
+def test_a_peer_that_sends_without_end_leaves_time_for_other_work(port: Port, path: Path) -> None:
+    link = links.connect(path)
+    assert port.accept()
+    assert list(link.packets()) == []
+    for i in range(links.PACKETS_PER_TURN + 2):
+        assert port.send(bytes([i + 1]))
+    assert [packet[0] for packet in link.packets()] == [*range(1, links.PACKETS_PER_TURN + 1)]
+    assert len(list(link.packets())) == 2
+    port.close()
+    with pytest.raises(LinkClosed):
+        list(link.packets())
+    link.close()

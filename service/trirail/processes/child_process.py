@@ -175,7 +175,7 @@ def _plan(child: Child) -> int:
             heart.beat()
             poll.poll(BEAT_EVERY * 1e3)
             newest = None  # only the newest request is planned, because nothing waits for earlier requests
-            while (packet := link.receive()) is not None:
+            for packet in link.packets():
                 newest = packet
             if newest is not None:
                 with suppress(Overtaken):

@@ -139,7 +139,7 @@ class Gateway:
                 for incoming in self._inbox.next_messages(MESSAGES_PER_TURN):
                     self._beat()
                     self._handle(incoming)
-                while (packet := self._link.receive()) is not None:
+                for packet in self._link.packets():
                     self._beat()
                     self._loop_death.record_activity()
                     self._handle_packet(packet, ready)

@@ -23,7 +23,7 @@ from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.event_codes import EventCode, EventText, coded
-from trirail.wire.links import LinkClosed, PacketLink
+from trirail.wire.links import PACKETS_PER_TURN, LinkClosed, PacketLink
 from trirail.wire.messages import Level, Notice
 from trirail.wire.packets import (
     Announcement,
@@ -156,7 +156,7 @@ def main(
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
     intake = Intake(config, record, link, ready)
     release_startup_memory()
-    ending = False
+    ending, received = False, 0
 
     def end(_signal: int, _frame: object) -> None:
         nonlocal ending
@@ -169,9 +169,11 @@ def main(
     try:
         while not ending:
             heart.beat()
-            poll.poll(500)
-            time.sleep(GATHER)
-            while (packet := link.receive()) is not None:
+            if received < PACKETS_PER_TURN:  # otherwise, more packets are waiting
+                poll.poll(500)
+                time.sleep(GATHER)
+            received = 0
+            for received, packet in enumerate(link.packets(), start=1):  # noqa: B007 - how many there were
                 intake.on_packet(packet)
                 heart.beat()
             intake.save()

@@ -11,6 +11,7 @@ import os
 import select
 import socket
 from array import array
+from collections.abc import Iterator
 from pathlib import Path
 
 from trirail.wire.sizes import MAX_PACKET, MAX_SHARED
@@ -19,6 +20,8 @@ _BUFFER = 1 << 22
 """Size of the kernel's buffer for a slow peer [bytes], enough for seconds of records.
 
 Without the right to exceed net.core.wmem_max, the process gets a smaller buffer."""
+PACKETS_PER_TURN = 64
+"""Maximum number of packets that are handled before other work is due."""
 _DESCRIPTOR = array("i").itemsize
 
 
@@ -91,6 +94,17 @@ class PacketLink:
         if not packet:
             raise LinkClosed
         return _read_shared(beside[0][2]) if beside else packet
+
+    def packets(self) -> Iterator[bytes]:
+        """Yield the packets that have arrived, at most PACKETS_PER_TURN.
+
+        A peer that sends as fast as this side receives thus cannot keep this side from its other work.
+        Raises LinkClosed if the peer has closed the connection.
+        """
+        for _ in range(PACKETS_PER_TURN):
+            if (packet := self.receive()) is None:
+                return
+            yield packet
 
     @property
     def ended(self) -> bool:
