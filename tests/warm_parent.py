@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from setproctitle import setproctitle
+from trirail.processes.realtime import die_with_parent
 
 LARGEST: Final = 1 << 17
 """Bytes of a request."""
@@ -46,11 +47,6 @@ class Warm:
                     self._forget(descriptor)
                 elif not self._receive():
                     return
-
-    def end(self) -> None:
-        """End what is left."""
-        for pid, _ in self._running.values():
-            os.kill(pid, signal.SIGTERM)
 
     def _receive(self) -> bool:
         packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 3)
@@ -104,6 +100,7 @@ def _program(request: dict[str, object], outputs: list[int]) -> NoReturn:
         os.environ.clear()
         os.environ.update(environment)
         os.setsid()
+        die_with_parent(signal.SIGTERM)  # however that ends, and that ends with the tests
         for output, stream in zip(outputs, (sys.stdout, sys.stderr), strict=True):
             os.dup2(output, stream.fileno())
             os.close(output)
@@ -148,11 +145,7 @@ def main() -> None:
     gc.collect()
     gc.freeze()
     with socket.socket(fileno=int(sys.argv[1])) as control:
-        warm = Warm(control)
-        try:
-            warm.serve()
-        finally:
-            warm.end()
+        Warm(control).serve()  # what is left ends with this process
 
 
 if __name__ == "__main__":
