@@ -9,9 +9,9 @@ WITHIN = 60.0
 """How long a busy machine may take for anything [s]."""
 
 
-def wait_until(condition: Callable[[], bool], what: str = "", pause: float = 0.002) -> None:
+def wait_until(condition: Callable[[], bool], what: str = "", pause: float = 0.002, within: float = WITHIN) -> None:
     """Return as soon as something holds; fail, with `what` it is, where it never does."""
-    deadline = time.monotonic() + WITHIN
+    deadline = time.monotonic() + within
     while not condition():
         assert time.monotonic() < deadline, what
         time.sleep(pause)
