@@ -58,7 +58,7 @@ def test_frames_are_measured_both_ways(capsys: pytest.CaptureFixture[str]) -> No
     assert_shown(told, capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_goals_are_measured_to_their_setpoints(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     latency = bench_latency.measure(rig, 2)
     assert latency["without_effect"] < 2 * latency["goals"]
@@ -66,7 +66,7 @@ def test_goals_are_measured_to_their_setpoints(rig: Rig, capsys: pytest.CaptureF
     assert_shown(latency, capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_what_one_users_flood_costs_another_is_measured(rig: Rig) -> None:
     told = bench_fairness.measure(rig, 4, rounds=1)
     assert told["messages_per_second"] > 0.0
@@ -75,8 +75,11 @@ def test_what_one_users_flood_costs_another_is_measured(rig: Rig) -> None:
         assert told[f"{what}_p99_ratio"] == told[f"{what}_flooded_ms"][1] / told[f"{what}_quiet_ms"][1]
 
 
-@pytest.mark.slow
-def test_the_loop_is_measured_beside_the_machine(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.alone
+def test_the_loop_is_measured_beside_the_machine(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_loop, "MOST_FAULTS", 100.0)  # measured although the machine stalls
     told = bench_loop.measure(0.6, (1000,), 1)
     (found,) = told["rates"]
     assert set(found["parts"]) == set(PART_NAMES)
