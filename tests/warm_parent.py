@@ -100,7 +100,7 @@ def _program(request: dict[str, object], outputs: list[int]) -> NoReturn:
         os.environ.clear()
         os.environ.update(environment)
         os.setsid()
-        die_with_parent(signal.SIGTERM)  # however that ends, and that ends with the tests
+        die_with_parent(signal.SIGTERM)  # even if the parent is killed; it ends with the tests
         for output, stream in zip(outputs, (sys.stdout, sys.stderr), strict=True):
             os.dup2(output, stream.fileno())
             os.close(output)
@@ -145,7 +145,7 @@ def main() -> None:
     gc.collect()
     gc.freeze()
     with socket.socket(fileno=int(sys.argv[1])) as control:
-        Warm(control).serve()  # what is left ends with this process
+        Warm(control).serve()  # programs that are still running end with this process
 
 
 if __name__ == "__main__":

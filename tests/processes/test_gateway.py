@@ -426,24 +426,24 @@ def test_what_the_loop_said_before_it_ended_is_heard_though_it_takes_nothing_any
 
 
 class BusyLoop(EndedLoop):
-    """A loop that always has something more to say, up to 1000 packets, and takes everything."""
+    """A loop that sends without a pause, and accepts everything."""
 
     def send(self, packet: bytes) -> bool:
         return FakeLink.send(self, packet)
 
 
-def test_a_loop_that_always_has_more_to_say_keeps_nobody_from_stopping_it(tmp_path: Path) -> None:
+def test_a_stop_is_forwarded_while_the_loop_keeps_sending(tmp_path: Path) -> None:
     accepted = packets.message(Accepted(1, GoalReply("g", 1.0)))
     with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
         link = BusyLoop(*[accepted] * 1000)
         gateway = Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG))  # type: ignore[arg-type]
 
-        def said(_packet: bytes, _ready: object) -> None:
-            if len(link._said) == 999:  # by now, whatever had arrived before has been handled
+        def handle(_packet: bytes, _ready: object) -> None:
+            if len(link._said) == 999:  # the stop arrives while packets of the loop are being handled
                 gateway._inbox._put(came("cmd", "trirail/demo/cmd/ann/stop", b""))
             if len(link._said) == 500:
                 assert any(isinstance(request, CommandRequest) for request in link.sent)
 
-        gateway._handle_packet = said  # type: ignore[assignment,method-assign]
+        gateway._handle_packet = handle  # type: ignore[assignment,method-assign]
         gateway.serve(lambda: None)
     assert not link._said

@@ -1,4 +1,4 @@
-"""The recorder process: its files are for owner and group, and are written however busy it is."""
+"""The recorder process: access rights of its files, and saving while packets keep arriving."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from control_rig import CONFIG
 from trirail.config import Config
 from trirail.processes import recording
 from trirail.processes.heartbeats import Heartbeats
+from trirail.telemetry.reading import read
 from trirail.wire.links import PACKETS_PER_TURN, LinkClosed, PacketLink
 from trirail.wire.packets import Kind
 from trirail.wire.records import DTYPE
@@ -45,7 +46,7 @@ def test_a_recording_and_its_folder_are_not_for_others(umask: int, tmp_path: Pat
 
 
 class BusyLink(PacketLink):
-    """A link on which the next packet has always arrived, 1000 times."""
+    """A link on which another packet is always waiting, until 1000 packets have been received."""
 
     taken = 0
 
@@ -58,16 +59,19 @@ class BusyLink(PacketLink):
         return bytes([Kind.RECORDS]) + record.tobytes()
 
 
-def test_a_recorder_that_always_has_more_to_write_saves_it_meanwhile(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is not saved is lost with the process, and a disk that takes nothing is told of when it is saved."""
+def test_the_recorder_saves_while_packets_keep_arriving(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Data that is not saved is lost if the process is killed, and a failing disk is reported when data is saved."""
     ours, loops = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     saved_at: list[int] = []
+    pauses: list[float] = []
     with ours, loops:
         link = BusyLink(ours)
         loops.send(b"more")
         monkeypatch.setattr(recording.Intake, "save", lambda _intake: saved_at.append(link.taken))
+        monkeypatch.setattr("trirail.processes.recording.time.sleep", pauses.append)
         heart = Heartbeats.create().heart("recorder")
         assert recording.main(config_in(tmp_path), None, link, heart, lambda _: None, lambda _: None) == 0
+    assert len(pauses) == 1  # the pause in which packets accumulate: none while packets are waiting
+    (file,) = tmp_path.glob("demo-*.rrd")
+    assert read(file).records["cycle"].tolist() == [*range(1, 1001)]
     assert np.diff([0, *saved_at, 1000]).max() <= PACKETS_PER_TURN

@@ -93,7 +93,7 @@ class Service:
         if self.process.poll() is None:  # whatever has failed: it must not disturb the tests to come
             self.process.terminate()
             self.process.wait(END_WITHIN)
-        sys.stdout.write(self.log.read_text()[-5000:])  # pytest shows it where a test has failed
+        sys.stdout.write(self.log.read_text()[-5000:])  # pytest prints it if the test fails
 
     def wait_up(self) -> None:
         """Wait until it says that it is up."""
@@ -761,8 +761,8 @@ def test_a_killed_recorder_does_not_matter(service: Service) -> None:
     assert service.end() == 0
     log = service.log.read_text()
     assert "the recorder has died (killed by SIGKILL)" in log
-    # Each recorder has a file, which it continues as -part2 where a slow disk takes nothing for seconds. A busy machine
-    # may freeze another recorder, which the supervisor then replaces, too.
+    # Each recorder begins one file, and continues in a file -part2 if the disk does not respond for seconds. On a busy
+    # machine, the supervisor may find another recorder frozen and replace it as well.
     begun = [path for path in (service.folder / "recordings").glob("*.rrd") if "-part" not in path.stem]
     assert len(begun) == 1 + log.count("the recorder has died (")
 

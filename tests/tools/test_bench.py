@@ -79,7 +79,7 @@ def test_what_one_users_flood_costs_another_is_measured(rig: Rig) -> None:
 def test_the_loop_is_measured_beside_the_machine(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench_loop, "MOST_FAULTS", 100.0)  # measured although the machine stalls
+    monkeypatch.setattr(bench_loop, "MOST_FAULTS", 100.0)  # a stall of the machine does not end the measurement
     told = bench_loop.measure(0.6, (1000,), 1)
     (found,) = told["rates"]
     assert set(found["parts"]) == set(PART_NAMES)

@@ -92,7 +92,7 @@ def test_nobody_listens(path: Path) -> None:
         links.connect(path)
 
 
-def test_a_peer_that_sends_without_end_leaves_time_for_other_work(port: Port, path: Path) -> None:
+def test_the_number_of_packets_per_turn_is_limited(port: Port, path: Path) -> None:
     link = links.connect(path)
     assert port.accept()
     assert list(link.packets()) == []

@@ -43,7 +43,8 @@ from trirail.wire.records import last_cycle
 GATHER = 0.14
 """Pause in which packets accumulate before they are read [s]. Waking up for each packet costs more than processing it.
 
-If the recorder is killed, less than 0.2 s of data is lost: the packets of this pause, and the batch in the loop.
+If the recorder is killed, less than 0.2 s of data is lost: the packets of this pause, and the batch in the loop. If the
+machine is too slow for the recorder, up to PACKETS_PER_TURN packets and those that wait in the socket are lost as well.
 """
 
 NOT_FOR_OTHERS = 0o027
@@ -173,7 +174,7 @@ def main(
                 poll.poll(500)
                 time.sleep(GATHER)
             received = 0
-            for received, packet in enumerate(link.packets(), start=1):  # noqa: B007 - how many there were
+            for received, packet in enumerate(link.packets(), start=1):  # noqa: B007 - the count is used in the next turn
                 intake.on_packet(packet)
                 heart.beat()
             intake.save()

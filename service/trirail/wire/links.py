@@ -98,7 +98,7 @@ class PacketLink:
     def packets(self) -> Iterator[bytes]:
         """Yield the packets that have arrived, at most PACKETS_PER_TURN.
 
-        A peer that sends as fast as this side receives thus cannot keep this side from its other work.
+        Because of the limit, a peer that sends without a pause does not prevent this side from doing other work.
         Raises LinkClosed if the peer has closed the connection.
         """
         for _ in range(PACKETS_PER_TURN):
