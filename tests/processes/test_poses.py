@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
+import os
 import random
 import tempfile
 import threading
@@ -11,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -183,6 +186,24 @@ def test_poses_whose_file_goes_are_neither_silently_kept_nor_lost(acts: list[str
             if not gone and file.exists():
                 assert set(json.loads(file.read_text())) == known
         asked.poses.close()
+
+
+@pytest.mark.parametrize("step", ["mkstemp", "fsync", "replace"])
+def test_a_first_pose_that_cannot_be_written_is_refused_and_nothing_counts_as_lost(
+    make: Make, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """Neither now nor after a restart: no file of poses has ever been there."""
+    asked, full = make(CONFIG), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with monkeypatch.context() as patched:
+        patched.setattr(tempfile if step == "mkstemp" else os, step, Mock(side_effect=full))
+        asked.teach("pick")
+    assert [refusal.code for refusal in asked.refusals] == [RefusalCode.FAILED]
+    for each in (asked, make(CONFIG)):
+        each.now += CHECK_PERIOD_S
+        each.poses.poll()
+        assert (each.told, each.poses.warnings()) == ([], ())
+    asked.teach("pick")
+    assert make(CONFIG).known() == {"pick": POSE}
 
 
 def test_it_is_answered_told_and_known_only_when_it_is_on_the_disk(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import fcntl
 import itertools
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -86,7 +86,7 @@ class PoseFile:
     def gone(self) -> bool:
         """True if the file does not exist although its folder exists, because the file was deleted or moved.
 
-        Removing the last pose does not delete the file.
+        Removing the last pose does not delete the file, and a first change that fails does not leave the folder.
         """
         return self.path.parent.is_dir() and not self.path.exists()
 
@@ -103,6 +103,7 @@ class PoseFile:
             Poses to write in addition if the file has been deleted.
 
         """
+        is_first = not self.path.parent.is_dir()
         try:
             files.make_folder(self.path.parent)
             with _alone_in(self.path.parent):
@@ -113,6 +114,10 @@ class PoseFile:
                 content = msgspec.json.encode(dict(sorted(taught.items())))
                 files.replace(self.path, msgspec.json.format(content) + b"\n")
         except OSError as error:
+            if is_first:
+                # An empty folder would mean that poses are lost, see `gone`. It stays if it contains anything.
+                with suppress(OSError):
+                    self.path.parent.rmdir()
             raise ServiceError(f"{error.filename or self.path}: {error.strerror}") from error
 
 
