@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 from trirail.processes import child_process
-from trirail.processes.child_process import MEASURED, Child
+from trirail.processes.child_process import COMPILING, MEASURED, Child
 
 
 class Said(msgspec.Struct):
@@ -66,3 +66,20 @@ def test_measurements_longer_than_a_pipe_takes_at_once_arrive(pipe: tuple[int, i
     said = Said(1, "x" * 10_000)
     child.report_measurements(said)
     assert msgspec.json.decode(heard(pipe[0])) == {MEASURED: msgspec.to_builtins(said)}
+
+
+def test_a_message_that_must_arrive_follows_the_rest_of_another(pipe: tuple[int, int]) -> None:
+    """A line in the middle of another would be two that nobody can read."""
+    read, write = pipe
+    fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, 8192)
+    child = Child("gateway", None, None, None, [], write)  # type: ignore[arg-type]
+    said = Said(1, "x" * 10_000)
+    child.report_measurements(said)
+    came = heard(read)
+    assert child._unsent
+    child.report_compiling("a function")
+    came += heard(read)
+    assert [*map(msgspec.json.decode, came.splitlines())] == [
+        {MEASURED: msgspec.to_builtins(said)},
+        {COMPILING: "a function"},
+    ]

@@ -72,33 +72,32 @@ class Child:
             self.heartbeats.heart(self.name).beat()
         self._send(content)
 
-    def _send(self, content: object) -> None:
-        with suppress(BrokenPipeError):  # the supervisor was killed: first the loop, then the other processes will end
-            os.write(self._pipe, msgspec.json.encode(content) + b"\n")
-
     def report_compiling(self, function: str) -> None:
         """Report to the supervisor that a function is being compiled."""
         self._send({COMPILING: function})
 
     def log(self, event: Event) -> None:
         """Send an event to the supervisor for the log; drop the event if the pipe is full for LOG_WITHIN."""
-        self._send_within({HAPPENED: event}, LOG_WITHIN)
+        self._send({HAPPENED: event}, LOG_WITHIN)
 
     def report_measurements(self, content: msgspec.Struct) -> None:
         """Send measurements to the supervisor; drop them if the pipe is full, because new ones follow in a second."""
-        self._send_within({MEASURED: content}, 0.0)
+        self._send({MEASURED: content}, 0.0)
 
-    def _send_within(self, content: object, seconds: float) -> None:
-        """Send a message, which is dropped if the pipe is full for `seconds`. Before it, send the rest of another."""
+    def _send(self, content: object, seconds: float | None = None) -> None:
+        """Send a message. Before it, send the rest of an earlier message, since each line must be complete.
+
+        The message is dropped if the pipe is full for `seconds`; None means that it is never dropped.
+        """
         self._unsent = self._send_part(self._unsent, seconds)
         if not self._unsent:
             line = msgspec.json.encode(content) + b"\n"
             rest = self._send_part(line, seconds)
             self._unsent = rest if len(rest) < len(line) else b""
 
-    def _send_part(self, line: bytes, seconds: float) -> bytes:
+    def _send_part(self, line: bytes, seconds: float | None) -> bytes:
         """Send as much of a line as the pipe takes, each part within `seconds`, and return the rest."""
-        with suppress(BrokenPipeError):
+        with suppress(BrokenPipeError):  # the supervisor was killed: first the loop, then the other processes will end
             while line and select.select([], [self._pipe], [], seconds)[1]:
                 os.write(self._pipe, line[: select.PIPE_BUF])  # more would wait for space, pipe(7)
                 line = line[select.PIPE_BUF :]
