@@ -265,6 +265,37 @@ def test_a_file_that_was_cut_off_is_refused(seed: int, tmp_path: Path) -> None:
         parameter_file.read(path)
 
 
+@pytest.mark.parametrize(
+    "end",
+    [
+        "[OptionalObjects]",
+        "SupportedObjects=47",
+        "1=0x1003",
+        "[ManufacturerObjects]",
+        "SupportedObjects=0",
+        "0\n\n",
+    ],
+)
+def test_a_file_that_was_cut_off_between_two_lists_is_refused(end: str, tmp_path: Path) -> None:
+    """Every object is described that it still lists."""
+    path = tmp_path / "a.dcf"
+    parameter_file.write(path, own())
+    before, found, _ = path.read_text().rpartition(end)
+    assert found
+    path.write_text(before)
+    with pytest.raises(DriveError, match=r"a\.dcf .*: its list \[\w+Objects\] is missing or too short"):
+        parameter_file.read(path)
+
+
+@pytest.mark.parametrize("spelt", [str.upper, str.lower])
+def test_lists_may_have_names_in_letters_of_either_case(spelt: Callable[[str], str], tmp_path: Path) -> None:
+    path = tmp_path / "a.dcf"
+    parameter_file.write(path, own())
+    text = re.sub(r"\[\w+Objects\]|SupportedObjects", lambda found: spelt(found[0]), path.read_text())
+    path.write_text(text)
+    assert parameter_file.read(path) == own()
+
+
 @pytest.mark.parametrize("name", ["a.dcf", "a.eds", "a.toml"])
 @pytest.mark.parametrize(
     ("made", "said"), [(lambda path: None, "No such file"), (Path.mkdir, "a folder"), (os.mkfifo, "a FIFO")]

@@ -37,8 +37,8 @@ IDENTITY: Final[Mapping[str, Key]] = {
 _UNUSED: Final = re.compile("FileInfo|Comments|DummyUsage|DeviceComm?issioning", re.IGNORECASE)
 """Names of sections that describe no object; canopen refuses some of these sections in files from other programs."""
 _KEYWORDS: Final = {each.lower(): each for each in ("ParameterValue", "NodeID", "LSS_SerialNumber")}
-_LISTS: Final = "MandatoryObjects", "OptionalObjects", "ManufacturerObjects"
-"""Sections that list the objects of a file."""
+_LISTS: Final = {each.upper(): each for each in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")}
+"""Sections that list the objects of a file, by their names in capital letters."""
 _COMPACT: Final = re.compile("([0-9a-f]{4})value", re.IGNORECASE)
 _TOML_TYPES: Final = {
     f"{'i' if each in SIGNED_TYPES else 'u'}{8 * ODVariable.STRUCT_TYPES[each].size}": each for each in INTEGER_TYPES
@@ -183,10 +183,7 @@ def _read_dcf(path: Path, node: int | None) -> SavedParameters:
     texts = {key: raw for key, each in variables(objects) if (raw := getattr(each, "value_raw", None))}
     if len(texts) != sum("ParameterValue" in section for section in sections.values()) or not texts:
         raise ValueError("a ParameterValue belongs to no object" if texts else "no object has a ParameterValue")
-    lists = [sections[name] for name in _LISTS if name in sections]
-    listed = {int(each[number], 0) for each in lists for number in filter(str.isdigit, each)}
-    if cut_off := sorted(listed - set(objects)):
-        raise ValueError(f"it lists object {cut_off[0]:04X} but does not describe it; is the file complete?")
+    _check_lists(sections, set(objects))
     info = objects.device_information
     numbers |= {"vendor": info.vendor_number, "product": info.product_number, "revision": info.revision_number}
     for name, key in IDENTITY.items():
@@ -230,6 +227,22 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
         elif compact := _COMPACT.fullmatch(name):
             _expand(sections, compact[1], sections[name])
     return sections, {"node": commissioned.get("NodeID"), "serial": commissioned.get("LSS_SerialNumber")}
+
+
+def _check_lists(sections: configparser.RawConfigParser, described: set[int]) -> None:
+    """Raise ValueError if the lists of objects show that the file was cut off."""
+    lists = {name.upper(): sections[name] for name in sections if name.upper() in _LISTS}
+    numbers = {name: [key for key in each if key.isdigit()] for name, each in lists.items()}
+    listed = {int(lists[name][number], 0) for name, each in numbers.items() for number in each}
+    if cut_off := sorted(listed - described):
+        raise ValueError(f"it lists object {cut_off[0]:04X} but does not describe it; is the file complete?")
+    if described - listed:  # some programs describe more objects than they list
+        return
+    # CiA 306: a file has all three lists, with SupportedObjects=0 if one is empty.
+    for name, title in _LISTS.items():
+        counts = [value for key, value in lists.get(name, {}).items() if key.upper() == "SUPPORTEDOBJECTS"]
+        if not counts or len(numbers[name]) < int(counts[0], 0):
+            raise ValueError(f"its list [{title}] is missing or too short; is the file complete?")
 
 
 def _expand(sections: configparser.RawConfigParser, index: str, values: Mapping[str, str]) -> None:
