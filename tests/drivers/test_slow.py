@@ -108,6 +108,35 @@ def test_a_drive_that_restarts_while_it_is_set_up_is_told(closing: Closing) -> N
     rig.drives.close()
 
 
+def _settings(rig: SlowRig) -> dict[int, object]:
+    """What the set-up has written into drive A and a restart loses."""
+    return {index: each for index, each in rig.nodes[0].local.data_store.items() if 0x1005 <= index < 0x1C00}
+
+
+@pytest.mark.generated(*range(24))
+def test_a_drive_that_restarts_at_any_time_is_told_or_has_all_its_settings(closing: Closing, seed: int) -> None:
+    """Also after its own set-up, while that of a slower one goes on, and just after that of all."""
+
+    def slow(node: int) -> Slowness:
+        return Slowness(answer=lambda: (0.001, 0.002, 0.003)[node - 1])
+
+    whole = closing(SlowRig("elmo_gold", slow))
+    whole.drives.configure(PERIOD)
+    took = whole.clock.now - 100.0
+    rig = closing(SlowRig("elmo_gold", slow))
+    rig.wires.slow[0].boots_in(random.Random(seed).uniform(0.0, took + PERIOD))
+    refused = ""
+    try:
+        rig.drives.configure(PERIOD)
+    except DriveError as error:
+        refused = str(error)
+    if refused:
+        assert refused == "drive A: the drive restarted during its set-up; check its power supply"
+        return
+    fault = [rig.cycle().fault for _ in range(3)][-1]
+    assert _settings(rig) == _settings(whole) or (fault is not None and "has restarted" in str(fault)), fault
+
+
 @settings(max_examples=16)
 @given(
     name=st.sampled_from(["elmo_gold", "technosoft_ipos", "ros2_cia402_slave", "pilz_prbt"]),

@@ -219,6 +219,10 @@ class Remote:
     def _called(self, key: Key) -> str:
         return f"object {key[0]:04X}:{key[1]:02X} ({self.name_of(key)})"
 
+    def restarted(self) -> RestartedError:
+        """Return the error of a drive that has restarted."""
+        return RestartedError(f"drive {self.name}: the drive restarted during its set-up; check its power supply")
+
     @contextmanager
     def _as_drive_error(self, attempt: str, key: Key) -> Iterator[None]:
         """Convert exceptions of canopen and the bus into DriveErrors."""
@@ -234,9 +238,7 @@ class Remote:
         except NoAnswerError as error:
             raise DriveTimeout(self.name, f"answer for {called}", self.client.timeout) from error
         except BootedError as error:
-            raise RestartedError(
-                f"drive {self.name}: the drive restarted during its set-up; check its power supply"
-            ) from error
+            raise self.restarted() from error
         except SdoCommunicationError as error:
             raise DriveError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
         except (can.CanError, OSError) as error:
@@ -250,7 +252,10 @@ def run_setups(
     doing: str,
     conversations: Sequence[Coroutine[Any, Any, T]],
 ) -> list[T | DriveError]:
-    """Run one conversation with each drive, all concurrently, and log the progress every second."""
+    """Run one conversation with each drive, all concurrently, and log the progress every second.
+
+    The result for a drive that restarts after its conversation, while others are still under way, is a RestartedError.
+    """
     over: set[str] = set()
 
     async def followed(remote: Remote, conversation: Coroutine[Any, Any, T]) -> T:
@@ -267,12 +272,20 @@ def run_setups(
     def progress() -> str:
         return f"set-up of the drives, {doing}: " + "; ".join(f"{each.name} {state(each)}" for each in remotes)
 
+    def observe(message: can.Message) -> None:
+        for remote in remotes:
+            remote.client.observe(message)
+
     pairs = zip(remotes, conversations, strict=True)
     try:
-        return run_concurrently(bus, clock, [followed(*pair) for pair in pairs], progress)
+        ends = run_concurrently(bus, clock, [followed(*pair) for pair in pairs], progress, observe)
     finally:
         for conversation in conversations:
             conversation.close()
+    return [
+        each.restarted() if each.client.has_booted and not isinstance(end, DriveError) else end
+        for each, end in zip(remotes, ends, strict=True)
+    ]
 
 
 def reason(code: int) -> str:

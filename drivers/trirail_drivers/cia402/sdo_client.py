@@ -48,7 +48,7 @@ class NoAnswerError(SdoCommunicationError):
 
 
 class BootedError(SdoCommunicationError):
-    """The drive has sent its boot-up message instead of an answer."""
+    """The drive has sent its boot-up message since the last answer."""
 
 
 class Client:
@@ -66,10 +66,16 @@ class Client:
         self.clock = clock
         self.answered = 0
         """Number of answered requests."""
+        self.has_booted = False
+        """Whether the drive has sent a boot-up message that no request has reported yet."""
         self._asked: bytes | None = None
         self._last = bytes(8)
         self._again = 0
         self._knows_no_segments = False
+
+    def observe(self, message: can.Message) -> None:
+        """Note a boot-up message, which may also arrive while no request is pending."""
+        self.has_booted |= self._is_boot_up(message)
 
     async def pause(self, seconds: float) -> None:
         """Wait for `seconds` [s]."""
@@ -129,6 +135,7 @@ class Client:
         await self.pause(ABORT_PAUSE_S)
 
     async def _request(self, request: bytes) -> bytes:
+        self._check_booted()
         self._asked = request
         self._send(request)
         frame = await Wait(self._is_awaited, self.clock() + self.timeout)
@@ -138,13 +145,18 @@ class Client:
         if frame is None:
             self._abort(*struct.unpack_from("<HB", request, 1), code=_TIMED_OUT)
             raise NoAnswerError("no answer")
+        self.observe(frame)
+        self._check_booted()
         answer = bytes(frame.data)
-        if frame.arbitration_id == canopen_frames.HEARTBEAT + self.node:
-            raise BootedError("the drive has restarted")
         self.answered += 1
         if answer[0] >> 5 == _ABORT:
             raise SdoAbortedError(int.from_bytes(answer[4:], "little"))
         return answer
+
+    def _check_booted(self) -> None:
+        booted, self.has_booted = self.has_booted, False
+        if booted:
+            raise BootedError("the drive has restarted")
 
     def _abort(self, index: int, subindex: int, *, code: int) -> None:
         self._send(struct.pack("<BHBI", _ABORT << 5, index, subindex, code))
@@ -164,15 +176,20 @@ class Client:
         """
         if message.is_error_frame or message.is_remote_frame:
             return False
+        if self._is_boot_up(message):
+            return self._asked is not None
         data = bytes(message.data)
-        if message.arbitration_id == canopen_frames.HEARTBEAT + self.node:
-            return self._asked is not None and data == bytes([canopen_frames.BOOT_UP])
         if message.arbitration_id != canopen_frames.SDO_ANSWER + self.node:
             return False
         if self._asked is not None and answers(self._asked, data):
             return True
         self._again += answers(self._last, data)
         return self._asked is not None and self._again >= MAX_SECOND_ANSWERS
+
+    def _is_boot_up(self, message: can.Message) -> bool:
+        own = message.arbitration_id == canopen_frames.HEARTBEAT + self.node
+        is_data = not (message.is_error_frame or message.is_remote_frame)
+        return own and is_data and bytes(message.data) == bytes([canopen_frames.BOOT_UP])
 
 
 def answers(request: bytes, data: bytes) -> bool:

@@ -40,11 +40,16 @@ class Wait:
 
 
 def run_concurrently(
-    bus: can.BusABC, clock: Clock, conversations: Sequence[Coroutine[Any, Any, T]], progress: Callable[[], str]
+    bus: can.BusABC,
+    clock: Clock,
+    conversations: Sequence[Coroutine[Any, Any, T]],
+    progress: Callable[[], str],
+    observe: Callable[[can.Message], None] = lambda _: None,
 ) -> list[T | DriveError]:
     """Run conversations concurrently; return the result or the DriveError of each conversation.
 
-    The text from `progress` is logged every second. A BusError affects all conversations, so it is raised.
+    The text from `progress` is logged every second. `observe` is called with every received frame, whether or not a
+    conversation awaits it. A BusError affects all conversations, so it is raised.
     """
     ends: dict[int, T | DriveError] = {}
     waits: dict[int, Wait] = {}
@@ -68,6 +73,8 @@ def run_concurrently(
             due = min(reported + PROGRESS_PERIOD, *(wait.deadline for wait in waits.values()))
             frame = _receive(bus, due - clock())
             now = due if frame is None else clock()  # some buses return a little early
+            if frame is not None:
+                observe(frame)
             for at, wait in list(waits.items()):  # a copy: resume changes the waits
                 if frame is not None and wait.accepts(frame):
                     resume(at, frame)
