@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import queue
 import subprocess
 import sys
 import threading
@@ -265,6 +266,17 @@ def test_what_waits_for_the_loop_does_not_begin_under_anothers_lease(rig: Rig) -
         (f"a{MAX_GOALS_OF_USER}", "lease acquired by bob"),
         (f"b{MAX_GOALS_OF_USER}", None),
     ]
+
+
+def test_a_published_event_has_the_identity_of_the_run(tmp_path: Path) -> None:
+    received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    event = Event("service", "info", "x", seq=1, t=0.0, cycle=1, time=0.0)
+    with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
+        gateway = Gateway(CONFIG, FakeLink(), lambda: None, opened, Guard(CONFIG), run="r")  # type: ignore[arg-type]
+        with opened.declare_subscriber("trirail/demo/event", lambda sample: received.put(sample.payload.to_bytes())):
+            gateway._handle_packet(packets.message(EventReport(event)), lambda: None)
+            assert json.loads(received.get(timeout=20.0))["run"] == "r"
+        gateway._replies.close()
 
 
 @pytest.mark.parametrize(("holder", "withdrawn"), [(None, True), ("ann", True), ("bob", False)])

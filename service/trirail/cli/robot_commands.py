@@ -405,17 +405,19 @@ def events(
     """
     with service.open() as robot:
         now = robot.state().t  # fails immediately without a service, whereas events would only be silent
-        seen = 0
+        seen = "", 0
         if last is not None:
             until_now = itertools.takewhile(
                 lambda event: event.t <= now, robot.events(history=True, timeout=HISTORY_TIMEOUT_S)
             )
             for event in deque(until_now, maxlen=last or None):
                 _show_event(service, event)
-                seen = event.seq
+                seen = event.run, event.seq
             if not follow:
                 return 0
-        for event in itertools.dropwhile(lambda event: event.seq <= seen, robot.events(history=True)):
+        for event in itertools.dropwhile(
+            lambda event: event.run == seen[0] and event.seq <= seen[1], robot.events(history=True)
+        ):
             _show_event(service, event)
     return 0
 

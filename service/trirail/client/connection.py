@@ -265,14 +265,17 @@ def _ignore(_reply: zenoh.Reply) -> None:
 def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:
     """Return a callback that passes each new event to `deliver`, and ignores repeated events.
 
-    A restarted gateway repeats past events. A restarted service numbers events from one again, with later times.
+    A restarted gateway repeats past events. A restarted service numbers events from one again, with another `run`. In
+    events of a service without `run`, a later time shows that it has restarted.
     """
-    last = 0, 0.0
+    newest: dict[str, int] = {}
+    last_time = 0.0
 
     def deliver_new(event: Event) -> None:
-        nonlocal last
-        if event.seq > last[0] or event.time > last[1]:
-            last = event.seq, event.time
+        nonlocal last_time
+        is_later = not event.run and event.time > last_time
+        if event.seq > newest.get(event.run, 0) or is_later:
+            newest[event.run], last_time = event.seq, event.time
             deliver(event)
 
     return deliver_new

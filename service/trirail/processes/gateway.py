@@ -83,8 +83,11 @@ class Gateway:
         urgent_section: Callable[[], AbstractContextManager[None]] = nullcontext,
         *,
         again: bool = False,
+        run: str = "",
     ) -> None:
-        """Create and connect the parts of the gateway. `again` is True if the service has already had a gateway."""
+        """Create and connect the parts of the gateway. `again` is True if the service has already had a gateway, and
+        `run` is the identity of this run of the service.
+        """
         self._log = log
         self._robot = config.robot.name
         self._link = link
@@ -124,7 +127,7 @@ class Gateway:
         )
         self._heap = HeapTrim()
         self._ending = False
-        self._publications = Publications(session, self._robot)
+        self._publications = Publications(session, self._robot, run)
 
     def serve(self, ready: Callable[[], None]) -> None:
         """Serve clients until `end` is called or the loop disconnects. Call `ready` after the loop's welcome."""
@@ -403,7 +406,16 @@ def main(
     guard = Guard(config, order.admission)
     with guard.open() as session:
         gateway = Gateway(
-            config, link, beat, session, guard, log, report_measurements, urgent_section, again=order.again
+            config,
+            link,
+            beat,
+            session,
+            guard,
+            log,
+            report_measurements,
+            urgent_section,
+            again=order.again,
+            run=order.run,
         )
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
 

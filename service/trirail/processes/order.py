@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from uuid import uuid4
+
 import msgspec
 
 from trirail.config import Config
@@ -21,3 +23,5 @@ class Order(msgspec.Struct, frozen=True):
     """Credentials and roles; None for a service without certificates."""
     again: bool = False
     """True if the process is being restarted."""
+    run: str = msgspec.field(default_factory=lambda: uuid4().hex)
+    """Identity of this run of the service, the same for a restarted process."""

@@ -46,9 +46,12 @@ class Publications:
     """Publishers on a robot's keys.
 
     States, summaries and records that a slow subscriber cannot receive are dropped. Events wait for the subscriber.
+    `run` is the identity of this run of the service, which clients receive with each event.
     """
 
-    def __init__(self, session: zenoh.Session, robot: str) -> None:
+    def __init__(self, session: zenoh.Session, robot: str, run: str = "") -> None:
+        self._run = run
+
         def dropping(name: str, encoding: str, priority: zenoh.Priority) -> zenoh.Publisher:
             return session.declare_publisher(
                 zenoh_session.key(robot, name),
@@ -84,7 +87,7 @@ class Publications:
 
     def event(self, event: Event) -> None:
         """Publish an event, and store it for clients that subscribe later."""
-        self._event.put(msgspec.json.encode(event))
+        self._event.put(msgspec.json.encode(msgspec.structs.replace(event, run=self._run)))
 
 
 def _bits(named: Mapping[str, tuple[int, int]], words: NDArray[np.uint32]) -> dict[str, bool]:

@@ -191,4 +191,7 @@ class Event(Notice, frozen=True, omit_defaults=True, kw_only=True):
     cycle: int
     """Number of the cycle in which the event happened, as in records."""
     time: float
-    """Wall-clock time of the event [s since 1970]."""
+    """Wall-clock time of the event [s since 1970]. It may jump if the clock is set."""
+    run: str = ""
+    """Identity of the run of the service that numbers the event; "" if the service is a version without it. A service
+    that starts again numbers events from one again, with another `run`."""
