@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 from alignment.cameras import Stage, camera
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, calibrate, to_base_frame
 from trirail.alignment.images import LENSES, Lens, locate_pixels, project_points, projection_jacobians
-from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves
+from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves, calibration_moves
 from trirail.errors import AlignmentError, AlignmentFault
 from trirail_drivers.interface import Triple
 
@@ -124,6 +124,37 @@ def test_a_mark_that_is_missing_in_a_look_is_missed_in_none_of_the_others() -> N
     found: CameraCalibration = calibrate(sights)
     assert found.marks["left"].place == pytest.approx(PART["left"], abs=1e-9)
     assert "left" not in found.residuals[3]
+
+
+@given(SEEDS, st.sampled_from(LENSES), st.booleans(), st.booleans(), st.integers(0, 2**31))
+def test_marks_that_are_swapped_in_one_look_are_refused(
+    seed: int, lens: Lens, one: bool, many: bool, look: int
+) -> None:
+    """A lens that bends absorbs most of a swap if the moves are few."""
+    stage = one_camera(seed, lens) if one else two_cameras(seed, lens, noise=0.05)
+    moves = MORE if many else calibration_moves(lens, 1e-3, math.radians(1.0))
+    swapped = look % (len(moves) + 1)
+    samples = []
+    for n, pose in enumerate(((0.0, 0.0, 0.0), *moves)):
+        stage.pose = pose
+        seen = stage.look()
+        apart = math.dist(seen["left"], seen["right"])
+        if n == swapped:
+            assume(apart > 20.0)
+            seen = {"left": seen["right"], "right": seen["left"]}
+        samples.append(CalibrationSample(pose, seen))
+    views = dict.fromkeys(PART, "camera") if one else None
+    with pytest.raises(AlignmentError, match=f"^look {swapped + 1}: marks left and right are swapped") as refused:
+        calibrate(samples, views, lens, (1000.0, 800.0))
+    assert refused.value.fault is AlignmentFault.SWAPPED
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(seed=SEEDS, one=st.booleans())
+def test_a_lens_that_the_calibration_does_not_model_is_no_swap(lens: Lens, seed: int, one: bool) -> None:
+    stage = one_camera(seed, lens) if one else two_cameras(seed, lens)
+    views = dict.fromkeys(stage.part, "camera") if one else None
+    assert stage.drive(calibrate_by_moves(MORE, views)).noise < 30.0
 
 
 def test_no_mark_at_all_is_refused() -> None:

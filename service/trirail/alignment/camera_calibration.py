@@ -8,8 +8,9 @@ initial value of a Gauss-Newton iteration.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -29,6 +30,10 @@ MAX_RESIDUAL_SHARE = 0.1
 """Residual of a view, as a fraction of the travel of its marks, above which the pictures do not match the moves. If one
 picture is late by one move, the residual is at least 0.3 of this move. Distortion by a lens causes a residual of
 0.01."""
+SUSPICIOUS_NOISE_PX = 1.0
+"""Noise above which marks may be swapped in a sample [pixel]. Marks are located with a noise of about 0.1 pixel."""
+MAX_SWAP_NOISE_SHARE = 0.1
+"""Two marks count as swapped if exchanging them reduces the noise to this fraction or less."""
 MAX_CONDITION = 1e6
 """Condition number of the scaled Jacobian above which the moves do not determine all unknowns."""
 
@@ -112,8 +117,51 @@ def calibrate(
     Raises
     ------
     AlignmentError
-        There are too few samples, the marks do not follow the moves, or the moves do not determine all unknowns.
+        There are too few samples, the marks do not follow the moves, the moves do not determine all unknowns, or two
+        marks are swapped in one sample.
     """
+    failure, noise = None, math.inf
+    try:
+        calibration = fit_cameras(samples, views, lens, centre, looks)
+        noise = calibration.noise
+    except AlignmentError as error:
+        failure = error
+    if noise > SUSPICIOUS_NOISE_PX:
+        # Few moves leave little redundancy, so the fit can absorb most of a swap. Only a fit without the swap shows it.
+        for number, one, other in _possible_swaps(samples):
+            exchanged = [*samples]
+            marks = samples[number].marks
+            exchanged[number] = samples[number]._replace(marks={**marks, one: marks[other], other: marks[one]})
+            try:
+                after = fit_cameras(exchanged, views, lens, centre, looks).noise
+            except AlignmentError:
+                continue
+            if after <= min(SUSPICIOUS_NOISE_PX, MAX_SWAP_NOISE_SHARE * noise):
+                raise AlignmentError(
+                    AlignmentFault.SWAPPED,
+                    f"look {number + 1}: marks {one} and {other} are swapped; calibrate again, and use coded marks if "
+                    "this happens repeatedly",
+                ) from failure
+    if failure is not None:
+        raise failure
+    return calibration
+
+
+def _possible_swaps(samples: Sequence[CalibrationSample]) -> Iterator[tuple[int, str, str]]:
+    """Yield the index of a sample and the names of two of its marks, for every pair of marks."""
+    for number, sample in enumerate(samples):
+        for one, other in itertools.combinations(sorted(sample.marks), 2):
+            yield number, one, other
+
+
+def fit_cameras(
+    samples: Sequence[CalibrationSample],
+    views: Mapping[str, str] | None = None,
+    lens: Lens = "affine",
+    centre: Pair | Mapping[str, Pair] = (0.0, 0.0),
+    looks: int = 1,
+) -> CameraCalibration:
+    """Fit the calibration to the marks, and do not look for swapped marks. Parameters are those of `calibrate`."""
     names = sorted({name for sample in samples for name in sample.marks})
     view_of = dict(views) if views is not None else {name: name for name in names}
     if unknown := [name for name in names if name not in view_of]:

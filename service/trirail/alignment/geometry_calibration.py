@@ -20,7 +20,7 @@ from trirail_drivers.interface import Triple
 from trirail.alignment import arguments
 from trirail.alignment.alignment_request import AlignmentRequest, LookReport, Observation, StageMotion
 from trirail.alignment.calibration_procedure import DEFAULT_MOVES, PLATFORM_CENTRE, ZERO_OFFSET
-from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, MarkFit, calibrate
+from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, MarkFit, fit_cameras
 from trirail.alignment.fresh_pictures import average, capture
 from trirail.alignment.images import Lens, Pair
 from trirail.alignment.pose_plan import choose_poses, find_candidates
@@ -254,7 +254,7 @@ def _first_calibration(samples: Sequence[CalibrationSample], views: Mapping[str,
         fits: list[CameraCalibration] = []
         for out in itertools.combinations(range(len(samples)), left_out):
             try:
-                fits.append(calibrate([each for n, each in enumerate(samples) if n not in out], views))
+                fits.append(fit_cameras([each for n, each in enumerate(samples) if n not in out], views))
             except AlignmentError as error:
                 failure = failure or error
         right = [
