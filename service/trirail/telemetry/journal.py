@@ -24,6 +24,7 @@ from trirail.wire.packets import (
     CheckRequest,
     CommandRequest,
     ControlInput,
+    DecidedAhead,
     Disturbance,
     DrivesFault,
     GoalRequest,
@@ -125,5 +126,7 @@ def _input_text(item: ControlInput) -> str:
             return f"plan {number}: {message}"
         case PlannerLost(reason=reason):
             return reason
+        case DecidedAhead(cycles=cycles):
+            return f"decided {cycles} cycles ahead"
         case Announcement(notice):
             return notice.message
