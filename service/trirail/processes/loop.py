@@ -203,10 +203,12 @@ class Loop:
             if number := self._cycles_beside(quiet, newest, next_ns):
                 self._decide_ahead(quiet, ticker, newest, number)
                 return
+            began_ns = self._now()
             quiet.conclude(newest)
             if not reports.due_after:
                 self._flush_beside()
             self._decide(next_ns, called=newest.called, due=newest.decides)
+            self._beside_budget.note(self._now() - began_ns)
             quiet.add(Part.DECIDE)
         elif not reports.due_after:
             self._flush_beside()
