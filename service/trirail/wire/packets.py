@@ -182,13 +182,6 @@ class DrivesFault(Struct, frozen=True, tag=True):
     """Names of the drives that cannot be reset yet."""
 
 
-class DecidedAhead(Struct, frozen=True, tag=True):
-    """Input of the control that it decides while the next cycles run, so that its decisions take effect after them."""
-
-    cycles: int
-    """Number of these cycles; 0 if a fault in the present cycle ends them."""
-
-
 class PlannerLost(Struct, frozen=True, tag=True):
     """Input of the control that the planner will not answer a request, because the planner has died or does not run."""
 
@@ -196,7 +189,7 @@ class PlannerLost(Struct, frozen=True, tag=True):
 
 
 Request = GoalRequest | CheckRequest | CommandRequest | Announcement
-GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost | DecidedAhead
+GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost
 
 
 class ControlInput(Struct, frozen=True, tag="Input"):  # recordings contain this tag
