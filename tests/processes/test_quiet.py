@@ -192,10 +192,17 @@ class Session:
                 turns += 1
             assert turns <= 2, "before a tick it is heard once who calls"
             self.takes_ns = 0  # a quiet cycle may have nothing to decide
-            while self.gateway.receive() is not None:
-                pass
-            while (packet := self.recorder.receive()) is not None:
-                self.heard += list(_comparable(packet))
+            self.listen()
+        if self.loop._work is not None:  # the last batch, which is sent beside the next cycles
+            self.loop._work()
+            self.listen()
+
+    def listen(self) -> None:
+        """Receive what the loop has said."""
+        while self.gateway.receive() is not None:
+            pass
+        while (packet := self.recorder.receive()) is not None:
+            self.heard += list(_comparable(packet))
 
 
 def _comparable(packet: bytes) -> Iterator[object]:
@@ -382,6 +389,7 @@ def both_ways(
         place = folder / str(quiet)
         place.mkdir()
         session = Session(config, place, carrier, quiet=quiet)
+        session.loop.beside = 0, 0  # Python's cycles know no cycles beside a decision
         try:
             session.run(script(), cycles)
         finally:

@@ -15,6 +15,7 @@ from trirail.wire.packets import (
     CheckRequest,
     CommandRequest,
     ControlInput,
+    DecidedAhead,
     Disturbance,
     GivenInput,
     GoalRequest,
@@ -30,6 +31,7 @@ PATH = PackedPath(b"abc", b"defg")
 AGAIN = coded("again", EventCode.RECORDED_AGAIN)
 
 LINES: list[tuple[GivenInput, str]] = [
+    (DecidedAhead(2), '{"type":"DecidedAhead","cycles":2}'),
     (
         Announcement(
             Notice("refused", "warning", "no", user="ann", code=RefusalCode.BUSY, event_code=EventCode.REFUSED)

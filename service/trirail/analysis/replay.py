@@ -13,6 +13,7 @@ next cycle.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -38,12 +39,13 @@ from trirail_drivers.interface import (
 from trirail.analysis.plan_comparison import is_same_plan
 from trirail.config import Config
 from trirail.control.control import Control, TimedInput
+from trirail.control.feedback import Snapshot
 from trirail.control.local_planner import LocalPlanner
 from trirail.errors import ServiceError
 from trirail.motion.motion_planner import MotionPlanner, revision
 from trirail.telemetry import provenance
 from trirail.telemetry.recording import Recording
-from trirail.wire.packets import ControlInput, DrivesFault, PlannerLost
+from trirail.wire.packets import ControlInput, DecidedAhead, DrivesFault, PlannerLost
 from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 from trirail.wire.vocabulary import MODES, Mode
 
@@ -102,6 +104,7 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
     clock = _SimulatedClock(config.period)
     drives = _simulated_drives(records, config, clock) if simulated else _RecordedDrives(records)
     requests = [entry for entry in inputs if not isinstance(entry.given, PlanAnswer | PlannerLost)]
+    number = sum(not isinstance(entry.given, DecidedAhead) for entry in requests)
     planner: _RecordedPlanner | LocalPlanner
     if len(requests) < len(inputs) and _has_same_plans(recording, config):
         planner = _RecordedPlanner(config)
@@ -120,7 +123,7 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
     return Comparison(
         cycles=len(records),
         lacking=len(recording.records) - len(records),
-        requests=len(requests),
+        requests=number,
         plans=planner.answers if isinstance(planner, _RecordedPlanner) else 0,
         plans_differing=planner.differing if isinstance(planner, _RecordedPlanner) else 0,
         plans_rounded=planner.rounded if isinstance(planner, _RecordedPlanner) else 0,
@@ -149,24 +152,31 @@ def _run(
     control.start(drives.read())
     control.modes.cycle = int(records["cycle"][0])
     pending = deque(inputs)
+    ahead = _Ahead(control, planner, pending)
     setpoints = np.zeros((len(records), 2, 3))
     modes = np.zeros(len(records), np.uint8)
     outputs = np.zeros((len(records), 3), np.int64)
     for row in range(len(records)):
         clock.step()
         drives.sync()
-        _run_cycle(control, drives, planner, list(_due_inputs(pending, control.cycles + 1)))
+        ahead.begin_cycle()
+        entries = list(_due_inputs(pending, control.cycles + 1))
+        _run_cycle(control, drives, planner, entries, ahead)
         setpoints[row] = control.setpoints.rows[:2]
         modes[row] = MODES.index(control.state.mode)
         outputs[row] = control.outputs.words
-        control.conclude()
+        ahead.end_cycle()
     return setpoints, modes, outputs
 
 
 def _run_cycle(
-    control: Control, drives: DriveGroup, planner: _RecordedPlanner | LocalPlanner, entries: Sequence[ControlInput]
+    control: Control,
+    drives: DriveGroup,
+    planner: _RecordedPlanner | LocalPlanner,
+    entries: Sequence[ControlInput],
+    ahead: _Ahead,
 ) -> None:
-    """Run the same steps that the loop runs in a cycle after its SYNC."""
+    """Decide as the loop did before a cycle, and run the same steps that the loop ran after the SYNC of the cycle."""
     inputs = [entry for entry in entries if not isinstance(entry.given, DrivesFault)]
     decided = [entry for entry in inputs if not entry.urgent]
     if isinstance(drives, _RecordedDrives):
@@ -174,14 +184,9 @@ def _run_cycle(
             if isinstance(entry.given, DrivesFault):
                 drives.set_fault(entry.given)
     # The loop handled inputs that arrived while it waited for its tick separately, after the other inputs.
-    for waiting in (False, True):
-        received = [entry for entry in decided if entry.waiting is waiting]
-        batch: list[TimedInput] = [(entry.given, entry.now_ns) for entry in received]  # type: ignore[misc]
-        if isinstance(planner, LocalPlanner):
-            batch += [(answer, 0) for answer in planner.answers()]
-        else:
-            planner.compare(received)
-        if batch or not waiting:
+    for waiting in (False, True) if not ahead.under_way else ():
+        batch = _batch([entry for entry in decided if entry.waiting is waiting], planner)
+        if batch or not (waiting or ahead.decided):
             control.decide(batch)
     for entry in inputs:
         if entry.urgent:
@@ -189,6 +194,97 @@ def _run_cycle(
     control.execute(drives.read())
     control.ledger.answers.clear()
     control.ledger.notices.clear()
+
+
+def _batch(entries: Sequence[ControlInput], planner: _RecordedPlanner | LocalPlanner) -> list[TimedInput]:
+    """Return inputs for the control, with the answers of a planner that makes the plans itself."""
+    batch: list[TimedInput] = [(entry.given, entry.now_ns) for entry in entries]  # type: ignore[misc]
+    if isinstance(planner, LocalPlanner):
+        batch += [(answer, 0) for answer in planner.answers()]
+    else:
+        planner.compare(entries)
+    return batch
+
+
+class _Ahead:
+    """Decisions that the control made while further cycles ran, see trirail.processes.quiet_cycles.
+
+    The control then knew the feedback before these cycles, and its decisions took effect after them.
+    """
+
+    def __init__(
+        self, control: Control, planner: _RecordedPlanner | LocalPlanner, pending: deque[ControlInput]
+    ) -> None:
+        self._control = control
+        self._planner = planner
+        self._pending = pending
+        self._last = 0
+        """Last cycle that ran beside the decision."""
+        self._known: Snapshot | None = None
+        self.decided = False
+        """Whether the decision for the present cycle was made ahead."""
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the present cycle ran beside a decision."""
+        return self._known is not None
+
+    def begin_cycle(self) -> None:
+        """Decide before the present cycle if a fault in this cycle ended the cycles beside the decision."""
+        inputs, cycle = self._inputs(), self._control.modes.cycle
+        if not self.under_way or len(inputs) == len(self._pending):
+            return
+        after = self._pending[len(inputs)]
+        if after.given == DecidedAhead(0) and after.cycle == cycle:
+            self._decide_in_vain(cycle)
+            self._pending.popleft()
+
+    def end_cycle(self) -> None:
+        """Evaluate the present cycle, or leave this to the decision beside which the cycle ran."""
+        control, pending = self._control, self._pending
+        cycle, self.decided = control.modes.cycle, False
+        if not self.under_way and pending and pending[0].cycle == cycle + 1:
+            content = pending[0].given
+            if isinstance(content, DecidedAhead):
+                pending.popleft()
+                self._last, self._known = cycle + content.cycles, control.measured.snapshot()
+                control.ahead = content.cycles
+        if not self.under_way:
+            control.conclude()
+        elif cycle < self._last:
+            control.modes.cycle += 1
+        else:
+            self._decide()
+
+    def _decide(self) -> None:
+        """Decide with the feedback from before the cycles beside the decision."""
+        assert self._known is not None
+        with self._control.measured.as_of(self._known):
+            self._control.conclude()
+            inputs = [self._pending.popleft() for _ in self._inputs()]
+            self._control.decide(_batch(inputs, self._planner))
+        self._known, self._control.ahead, self.decided = None, 0, True
+
+    def _decide_in_vain(self, cycle: int) -> None:
+        """Decide although a fault in cycle `cycle` ends the cycles beside the decision, and go back to that cycle."""
+        control = self._control
+        arrays, missing = control.commanded_arrays(), self._last + 1 - cycle
+        before = [array.copy() for array in arrays]
+        with control.measured.as_of(control.measured.snapshot()):
+            control.advance(missing)
+            control.modes.cycle = self._last
+            self._decide()
+        for array, copy in zip(arrays, before, strict=True):
+            array[:] = copy
+        control.return_to(cycle - 1)
+
+    def _inputs(self) -> list[ControlInput]:
+        """Return the pending inputs that the decision took into account."""
+        return list(itertools.takewhile(self._belongs, self._pending))
+
+    def _belongs(self, entry: ControlInput) -> bool:
+        later = entry.urgent or entry.waiting or isinstance(entry.given, DrivesFault | DecidedAhead)
+        return entry.cycle == self._last + 1 and not later
 
 
 def _due_inputs(pending: deque[ControlInput], cycle: int) -> Iterator[ControlInput]:

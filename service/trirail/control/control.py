@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+from numpy.typing import NDArray
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
 from trirail import naming
@@ -114,6 +115,8 @@ class Control:
         self._solve_code = 0
         self._concluding = False
         """Whether the setpoints of the current cycle have been sent."""
+        self.ahead = 0
+        """Number of cycles between the newest feedback that the control knows and the present commanded motion."""
 
     @property
     def cycles(self) -> int:
@@ -192,6 +195,31 @@ class Control:
         if code is not None:
             self.modes.cycle, self._solve_code = newest, code
             self.conclude()
+
+    def foresee(self, number: int) -> None:
+        """Advance the commanded motion by `number` cycles that compiled code is about to run, and evaluate the last.
+
+        Decisions then take effect after these cycles. They know the feedback of the drives before these cycles.
+        """
+        self.ahead = number
+        self.advance(number)
+        self.modes.cycle += number - 1
+        self.conclude()
+
+    def advance(self, number: int) -> None:
+        """Advance the commanded motion by a number of cycles. The control does not evaluate these cycles."""
+        for _ in range(number):
+            self._solve_code = self.setpoints.solve(self.schedule, self.schedule.begin_cycle())
+
+    def commanded_arrays(self) -> tuple[NDArray[Any], ...]:
+        """Return the arrays that `advance` changes, except for the record."""
+        schedule, setpoints = self.schedule, self.setpoints
+        return schedule.motion, setpoints.sliders, setpoints.bounds, setpoints.refused_values, self.measured.backlash
+
+    def return_to(self, newest: int) -> None:
+        """Continue after cycle `newest`, although later cycles were foreseen; only for a fault that stops the robot."""
+        self.schedule.cycle += newest - self.cycles
+        self.modes.cycle = newest + 1
 
     def cycle(self, read: Callable[[], Feedback], inputs: Iterable[TimedInput] = ()) -> None:
         """Run one complete cycle: handle the inputs, `read` the feedback, execute the cycle, and evaluate it."""
@@ -535,7 +563,7 @@ class Control:
     def _check_arrival(self) -> None:
         """End a goal after the end of its path, once the robot is in position or the time-out has elapsed."""
         settling = self.measured.settling
-        settled = settling.result(self.modes.cycle)
+        settled = settling.result(self.modes.cycle - self.ahead)
         if settled is None:
             return
         outcome: Outcome = "done" if settled.settle is not None else "unsettled"

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 from trirail_drivers.interface import Feedback, PowerState, Triple
 
 from trirail.config import InPosition
@@ -18,6 +23,27 @@ from trirail.wire.records import DTYPE
 WINDOWS = InPosition()
 CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 """States in which a drive can move its slider."""
+
+
+def pack_feedback(feedback: Feedback, numbers: NDArray[np.void]) -> None:
+    """Write the numeric fields of a feedback to element 0 of an array of dtype trirail.control.cycle.FEEDBACK."""
+    cycle.FEEDBACK_STRUCT.pack_into(
+        numbers.view(np.uint8).data,
+        0,
+        *feedback.position,
+        *feedback.age,
+        *feedback.state,
+        *feedback.follows,
+        *feedback.homed,
+        feedback.homing,
+    )
+
+
+class Snapshot(NamedTuple):
+    """Copy of the feedback after a cycle, and of the arrays that depend on it."""
+
+    feedback: Feedback
+    arrays: tuple[NDArray[Any], ...]
 
 
 class MeasuredState:
@@ -61,7 +87,6 @@ class MeasuredState:
         # The age of a position may be wrong by one cycle. Two steps then appear as one.
         self.fastest = 2.0 * step / period
         self.limit = limit
-        self._packed = self.numbers.view(np.uint8).data
         self.written = np.zeros((2 + cycle.MAX_AGE, 3))
         self.scratch = np.zeros((2, 3))
 
@@ -135,6 +160,29 @@ class MeasuredState:
             self.record,
         )
 
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the present state for `as_of`."""
+        return Snapshot(self.feedback, tuple(array.copy() for array in self._arrays))
+
+    @contextlib.contextmanager
+    def as_of(self, earlier: Snapshot) -> Iterator[None]:
+        """Return to an earlier state while the body of the `with` statement runs."""
+        now = self.snapshot()
+        self._load(earlier)
+        try:
+            yield
+        finally:
+            self._load(now)
+
+    def _load(self, snapshot: Snapshot) -> None:
+        self.feedback = snapshot.feedback
+        for array, copy in zip(self._arrays, snapshot.arrays, strict=True):
+            array[:] = copy
+
+    @property
+    def _arrays(self) -> tuple[NDArray[Any], ...]:
+        return self.record, self.numbers, self.jumping, self.settling.monitored
+
     def pose_of(self, sliders: Triple) -> Triple | None:
         """Return the pose that matches slider setpoints, on the branch of the latest pose; None if no pose matches."""
         self.scratch[:] = sliders, self.pose
@@ -146,16 +194,7 @@ class MeasuredState:
 
     def _pack(self, feedback: Feedback) -> None:
         self.feedback = feedback
-        cycle.FEEDBACK_STRUCT.pack_into(
-            self._packed,
-            0,
-            *feedback.position,
-            *feedback.age,
-            *feedback.state,
-            *feedback.follows,
-            *feedback.homed,
-            feedback.homing,
-        )
+        pack_feedback(feedback, self.numbers)
         self.record["inputs"] = feedback.inputs
 
     def _recorded(self, field: str) -> Triple:

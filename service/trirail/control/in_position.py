@@ -78,8 +78,6 @@ class Settling:
     def begin(self, cycle: int) -> None:
         """Start monitoring a goal whose path ends with the setpoints of this cycle."""
         self._since = cycle
-        self.monitored["inside"] = 0
-        self.monitored["overshoot"] = 0.0
 
     def cancel(self) -> None:
         """Stop monitoring the goal."""
@@ -144,6 +142,7 @@ def monitor(record: NDArray[np.void], known: bool, at_rest: bool, monitored: NDA
                 state.heading[i] = 0.0
             if abs(row.commanded_velocity[i]) > MIN_VELOCITY:
                 state.heading[i] = math.copysign(1.0, row.commanded_velocity[i])
+            state.overshoot[i] = 0.0
         state.moved, state.inside, row.settled = 1, 0, 0
         return
     state.moved = 0

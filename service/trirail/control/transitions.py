@@ -83,7 +83,19 @@ class Transitions:
         self._edge: EventText | None = None
         """Text about the input edge that has stopped the current goal; None if no edge has stopped the goal."""
         self.orders = 0
-        """Number of actions that have been sent to the drives."""
+        """Number of commands to the drives, including those that wait."""
+        self._waiting: list[Callable[[DriveGroup], None]] | None = None
+        """Commands to the drives that wait until `send_commands`; None if commands are sent immediately."""
+
+    def hold_commands(self) -> None:
+        """Let commands to the drives wait until `send_commands`, because compiled code uses the drives' tables."""
+        self._waiting = []
+
+    def send_commands(self) -> None:
+        """Send the waiting commands to the drives, and send further commands immediately."""
+        waiting, self._waiting = self._waiting or (), None
+        for command in waiting:
+            command(self._drives)
 
     def check(self, event: ModeEvent) -> Step:
         """Return the effect that an event would have now. Raises RefusedError if the current mode does not allow it."""
@@ -156,7 +168,10 @@ class Transitions:
     def _act(self, decided: Step) -> None:
         if (order := _ORDERS.get(decided.action)) is not None:
             self.orders += 1
-            order(self._drives)
+            if self._waiting is not None:
+                self._waiting.append(order)
+            else:
+                order(self._drives)
         match decided.action:
             case Action.CLEAR:
                 self.fault = None

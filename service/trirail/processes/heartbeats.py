@@ -103,6 +103,11 @@ class UrgentFlag:
         self.seen = 0
         """Count of urgent requests at the last check."""
 
+    @property
+    def raised(self) -> bool:
+        """True if there has been an urgent request since the last call of `was_raised`."""
+        return self.seen != self._counts[URGENT_INDEX]
+
     def was_raised(self) -> bool:
         """Return True if there has been an urgent request since the last call."""
         before, self.seen = self.seen, self._counts[URGENT_INDEX]

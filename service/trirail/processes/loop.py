@@ -17,10 +17,11 @@ from trirail.processes.clock import Overruns, PollSet, Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
 from trirail.processes.quiet import Reached
-from trirail.processes.quiet_cycles import QuietCycles
+from trirail.processes.quiet_cycles import QuietCycles, QuietResult
 from trirail.processes.reports import Reports
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.packets import (
+    DecidedAhead,
     Disturbance,
     DrivesFault,
     Request,
@@ -42,6 +43,10 @@ If less time is left, the next cycle serves the call.
 """
 LONGEST_CALL = 0.9
 """Limit of that time, as a fraction of the period, above which it would never be measured again."""
+HANDOVER_NS = 200_000
+"""Time for handing over to the thread that decides beside the cycles, and for preparing the next motion [ns]."""
+MOST_AHEAD = 2
+"""Maximum number of cycles by which a decision is made ahead. A stop that is not a quick stop waits for their end."""
 BUDGET_DECAY = 1 / 32
 """Fraction by which a budget shrinks each time the work takes less time than the budget."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
@@ -123,10 +128,15 @@ class Loop:
         """True if no further call is served before the next tick."""
         self._reports_postponed = False
         """True if events and answers have not been sent yet, because too little time was left before a tick."""
+        self._work: Callable[[], None] | None = None
+        """Work that is due beside the next cycles."""
+        self._beside_budget = TimeBudget(DECISION_BUDGET_NS, MOST_AHEAD * self._period_ns)
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
             beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
             self._quiet = QuietCycles(self.control, drives, *beside, config.loop.busy_wait_ns)
+        self.beside = 0, MOST_AHEAD
+        """Minimum and maximum number of cycles that run beside a decision, which tests change."""
         self._fault: DriveFault | None = None
         self._unready: tuple[str, ...] = ()
         self._marked_ns = 0
@@ -162,9 +172,13 @@ class Loop:
         disturbed = self.ending or self._gateway.frozen or not self._planner.idle
         if quiet is not None and not disturbed:
             spare_ns, once = self._call_budget.ns, self._postponed
-            newest = quiet.run(ticker, self._overruns, spare_ns, listens=not self._listened, once=once)
+            work, self._work = self._work, None
+            newest = quiet.run(ticker, self._overruns, spare_ns, work, listens=not self._listened, once=once)
         elif quiet is not None:
             quiet.leave()
+        if newest is None and self._work is not None:
+            self._flush()
+            self._work = None
         if newest is None and not self._listened and ticker.listen(self._poll_set, self._call_budget.ns):
             self._serve_call(ticker)
         elif newest is None:
@@ -173,19 +187,137 @@ class Loop:
             self.cycle(ticker.tick())
         elif newest.reached is Reached.SYNCED:
             self._marked_ns = newest.marked_ns
-            self._continue_after_sync(Tick(newest.deadline_ns, newest.lateness_ns, newest.missed))
+            self._continue_after_sync(newest.tick)
         elif newest.reached in (Reached.OBSERVED, Reached.SOLVED):
-            self._marked_ns = newest.marked_ns
-            code = newest.code if newest.reached is Reached.SOLVED else None
-            self.control.execute(self.control.measured.feedback, self._mark, behind=newest.behind, code=code)
-            self._end(Tick(newest.deadline_ns, newest.lateness_ns, newest.missed))
+            self._continue_solved(newest)
         elif newest.reached is Reached.CALLED:
             self._serve_call(ticker)
         elif quiet is not None:
             self._listened = self._never_listens
-            if newest.called or newest.decides or self._postponed or not self._reports.due_after:
-                self._decide(newest.deadline_ns + self._period_ns, called=newest.called, due=newest.decides)
-                quiet.add(Part.DECIDE)
+            self._follow_up(quiet, ticker, newest)
+
+    def _follow_up(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult) -> None:
+        """Do the work that is due after a complete cycle, either before the next tick or beside the next cycles."""
+        reports, next_ns = self._reports, newest.deadline_ns + self._period_ns
+        if newest.called or newest.decides or self._postponed or reports.misses_recorder:
+            if number := self._cycles_beside(quiet, newest, next_ns):
+                self._decide_ahead(quiet, ticker, newest, number)
+                return
+            began_ns = self._now()
+            quiet.conclude(newest)
+            if not reports.due_after:
+                self._flush_beside()
+            self._decide(next_ns, called=newest.called, due=newest.decides)
+            self._beside_budget.note(self._now() - began_ns)
+            quiet.add(Part.DECIDE)
+        elif not reports.due_after:
+            self._flush_beside()
+
+    def _flush_beside(self) -> None:
+        """Send the batch of records beside the next cycles."""
+        self._reports.set_batch_aside()
+        self._work = self._flush
+
+    def _cycles_beside(self, quiet: QuietCycles, newest: QuietResult, next_ns: int) -> int:
+        """Return the number of cycles that must run beside a decision, so that none of them is late.
+
+        A decision that is due in a certain cycle is made for exactly that cycle.
+        """
+        budget_ns = self._beside_budget.ns + HANDOVER_NS
+        quiet.lead = self._missing_cycles(budget_ns - self._period_ns)
+        if newest.reached is not Reached.DONE or not quiet.runs_beside:
+            return 0
+        number, until_due = self._missing_cycles(budget_ns - (next_ns - self._now())), quiet.due - newest.cycle
+        if until_due < 0:
+            return number
+        return until_due if newest.decides and until_due <= self.beside[1] else min(number, until_due)
+
+    def _missing_cycles(self, missing_ns: int) -> int:
+        """Return the number of cycles, at most MOST_AHEAD, that last for `missing_ns` [ns]."""
+        least, most = self.beside
+        return min(max(least, -(-missing_ns // self._period_ns)), most)
+
+    def _decide_ahead(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, number: int) -> None:
+        """Decide beside the next `number` cycles."""
+        control, reports, began_ns = self.control, self._reports, self._now()
+        next_ns = newest.deadline_ns + (number + 1) * self._period_ns
+        if flushes := reports.due_after <= number:
+            reports.set_batch_aside()
+
+        def work() -> None:
+            reports.note(next_ns, DecidedAhead(number))
+            control.foresee(number)
+            if newest.called:
+                self._read()
+            self._pass_to_control(self._noted(next_ns))
+            self._send_reports()
+            if flushes:
+                self._flush()
+            self._beside_budget.note(self._now() - began_ns)
+
+        control.modes.hold_commands()
+        last = quiet.run_beside(ticker, self._overruns, number, work)
+        self._finish_beside(quiet, ticker, last, newest.cycle + number)
+        control.modes.send_commands()
+        control.ahead = 0
+
+    def _finish_beside(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
+        """Finish the cycles beside which the control has decided, up to cycle `last`, if they have needed Python.
+
+        They go on with the motion from before the decision. A fault or a quick stop ends them.
+        """
+        reached, tick, done = newest.reached, newest.tick, newest.cycle
+        if reached is not Reached.DONE:
+            quiet.leave_at(reached)
+        if reached is Reached.WRITTEN:
+            quiet.send_on()
+        if reached is Reached.SYNCED and self._quick_stop_waits():
+            self._end_ahead(quiet, done)
+            self._continue_after_sync(tick)
+            return
+        while reached in (Reached.OBSERVED, Reached.SOLVED) or done < last:
+            if reached not in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED):
+                tick = ticker.tick() if reached is Reached.WAITED else ticker.wait()
+                self._drives.sync()
+                reached = Reached.SYNCED
+            if reached is Reached.SYNCED:
+                feedback = self._drives.read()
+                if feedback.fault is not None:
+                    self._end_ahead(quiet, done)
+                    self._handle_urgent(self._watch(tick, feedback), tick.deadline_ns + tick.lateness_ns)
+                    self.control.execute(feedback, self._mark)
+                    self._end(tick)
+                    return
+                self._overruns.all += tick.missed
+                reached = quiet.solve(feedback, tick)
+            if quiet.is_refused(reached):
+                self._end_ahead(quiet, done)
+                self._continue_solved(quiet.result(reached))
+                return
+            self._drives.write(*quiet.setpoints)
+            done, reached = quiet.record(self._overruns), Reached.DONE
+        quiet.copy_measured_back()
+
+    def _quick_stop_waits(self) -> bool:
+        """Return True if the gateway has sent a quick stop; other stops wait until they can brake the new motion."""
+        if self._urgent_flag.raised:
+            self._gateway.read(URGENT_REQUESTS_A_CYCLE)
+        return self._gateway.has_quick_stop
+
+    def _end_ahead(self, quiet: QuietCycles, done: int) -> None:
+        """Let the control continue after cycle `done`, although its decisions were to take effect later."""
+        quiet.copy_back()
+        self.control.ahead = 0
+        self.control.return_to(done)
+        self._reports.note(self._now(), DecidedAhead(0))
+        self.control.modes.send_commands()
+
+    def _continue_solved(self, newest: QuietResult) -> None:
+        """Run the rest of a cycle whose feedback has been evaluated, and end the cycle."""
+        self._marked_ns = newest.marked_ns
+        code = newest.code if newest.reached is Reached.SOLVED else None
+        self.control.execute(self.control.measured.feedback, self._mark, behind=newest.behind, code=code)
+        self._end(newest.tick)
 
     def cycle(self, tick: Tick) -> None:
         """Run one cycle in Python. Nothing in a cycle waits, and any failure in a cycle stops the robot."""

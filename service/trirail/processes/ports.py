@@ -9,8 +9,9 @@ from trirail.processes.heartbeats import Watch
 from trirail.wire.decoding import INVALID
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.links import Port
-from trirail.wire.packets import PlannerLost, Request, decode_request
+from trirail.wire.packets import CommandRequest, PlannerLost, Request, decode_request
 from trirail.wire.plan_packets import PlanAnswer, PlanRequest, decode_plan_answer, encode
+from trirail.wire.vocabulary import Command
 
 
 class Ports(NamedTuple):
@@ -68,6 +69,12 @@ class GatewayLink:
                 self._in_hand.append(decode_request(memoryview(packet)[1:]))
             except INVALID:
                 self._port.hang_up()
+
+    @property
+    def has_quick_stop(self) -> bool:
+        """True if a quick stop is among the requests that have been read but not handled."""
+        quick_stop = Command.QUICK_STOP
+        return any(isinstance(each, CommandRequest) and each.name is quick_stop for each in self._in_hand)
 
     def requests(self) -> Iterator[Request]:
         """Yield the requests that have been read but not handled; none while the gateway is frozen."""

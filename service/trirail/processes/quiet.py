@@ -6,6 +6,7 @@ applies the last gate to the setpoints, and writes setpoints and record. The cal
 must be made before the setpoints are sent: if a drive sends anything other than its position, a request is urgent, a
 neighbour has disconnected, or the last gate refuses a setpoint. In these cases the call returns at the stage that it
 has reached, and Python continues from there. If other work is due, the call returns after the setpoints have been sent.
+While Python decides beside the cycles, other neighbours and other decisions wait.
 
 A signal does not end a wait. Python's signal handlers run when the call has returned, which is at the end of a batch of
 records at the latest.
@@ -234,7 +235,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
     s.lateness_ns = now - s.deadline_ns
     s.missed = max(0, s.lateness_ns // s.period_ns)
     t = now / 1e9
-    if (s.missed and s.in_a_row + s.missed > s.allowed) or t >= times[0].due:
+    if (s.missed and s.in_a_row + s.missed > s.allowed and not s.beside) or t >= times[0].due:
         return Reached.WAITED
     s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
     s.synced, s.handled, s.arrived = t, 0, 0
@@ -265,7 +266,8 @@ def _read(
     s, pollfds, hearts, axes = state[0], neighbours.pollfds, neighbours.hearts, frames.axes
     count = hearts[s.gateway_place]  # the same check as in trirail.processes.heartbeats.Watch
     turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
-    if hearts[URGENT_INDEX] != s.urgent_seen or pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience:
+    lost = pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience
+    if hearts[URGENT_INDEX] != s.urgent_seen or (lost and not s.beside):
         return Reached.SYNCED
     t = _now_ns(state, moment) / 1e9
     if not (_receive(s, moment, frames, t) and end_read(axes, frames.times, frames.history, t)):
@@ -283,8 +285,8 @@ def _read(
     return CONTINUE
 
 
-@compiled()
-def _solve(
+@compiled(i8(_STATE, i8[::1], _FRAME_TABLES, _ROBOT, _MOTION))
+def solve(
     state: NDArray[np.void], moment: NDArray[np.int64], frames: FrameTables, robot: RobotArrays, motion: MotionArrays
 ) -> int:
     """Evaluate the feedback, and write the next setpoints into their frames. Return CONTINUE, or the reached stage."""
@@ -350,10 +352,10 @@ def _switch_outputs(
     return True
 
 
-@compiled()
-def _record(s: Any, robot: RobotArrays, batch: NDArray[np.uint8]) -> None:
-    """Complete the record of the cycle, and append it to the batch."""
-    row = robot.record[0]
+@compiled(i8(_STATE, _ROBOT, FRAMES))
+def record(state: NDArray[np.void], robot: RobotArrays, batch: NDArray[np.uint8]) -> int:
+    """Complete the record of the cycle, append it to the batch, and return the number of the cycle."""
+    s, row = state[0], robot.record[0]
     s.cycle += 1
     row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
     row.parts_ns[:] = s.parts_ns
@@ -361,6 +363,7 @@ def _record(s: Any, robot: RobotArrays, batch: NDArray[np.uint8]) -> None:
     row.mode = s.mode
     batch[s.batched] = robot.packed
     s.batched += 1
+    return int(s.cycle)
 
 
 @compiled(i8(_STATE, i8[::1], _NEIGHBOURS, _FRAME_TABLES, _ROBOT, _MOTION, _OUTPUTS), releases=True)
@@ -389,7 +392,7 @@ def run(
         if reached == CONTINUE:
             reached = _read(state, moment, neighbours, frames, robot.feedback)
         if reached == CONTINUE:
-            reached = _solve(state, moment, frames, robot, motion)
+            reached = solve(state, moment, frames, robot, motion)
         if reached != CONTINUE:
             return reached
         if not _switch_outputs(s, frames.axes, robot.record, motion, tables):
@@ -400,10 +403,10 @@ def run(
             frames.bus, frames.switchings, frames.pins, frames.axes, frames.times
         )
         _mark(state, moment, Part.WRITE)
-        _record(s, robot, neighbours.batch)
+        record(state, robot, neighbours.batch)
         _mark(state, moment, Part.RECORD)
         if not accepted:
             return Reached.WRITTEN
-        if s.called or s.decides:
+        if (s.called or s.decides) and not s.beside:
             return Reached.DONE
     return Reached.DONE

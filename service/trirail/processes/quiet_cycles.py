@@ -1,18 +1,30 @@
-"""Python code that prepares and calls the compiled function, which runs the cycles without events."""
+"""Python code that prepares and calls the compiled function, which runs the cycles without events.
+
+Compiled code has arrays of its own for the state of the robot. They are copies of the control's arrays before each
+call, and are copied back after it. Python can therefore decide beside the cycles, in a thread of its own: the control
+first advances its commanded motion by the cycles that compiled code is about to run (Control.foresee), so that its
+decisions take effect after them. Both compute the same setpoints, since they call the same functions.
+"""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from trirail_drivers.driver.cyclic import Cyclic, Lender
+from trirail_drivers.interface import Feedback, Triple
 
+from trirail.control import cycle
 from trirail.control.control import Control, SteadyState
+from trirail.control.feedback import pack_feedback
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run
 from trirail.processes import quiet
-from trirail.processes.clock import Overruns, PollSet, Ticker
+from trirail.processes.clock import Overruns, PollSet, Tick, Ticker
+from trirail.processes.companion import Companion
 from trirail.processes.heartbeats import PROCESSES, URGENT_INDEX, Heartbeats, UrgentFlag, Watch
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_state import STATE, QuietState
@@ -32,6 +44,8 @@ class QuietResult(NamedTuple):
     """Result of the compiled call, which describes the newest cycle that the call has begun."""
 
     reached: Reached
+    cycle: int
+    """Number of the last complete cycle."""
     deadline_ns: int
     lateness_ns: int
     missed: int
@@ -46,6 +60,38 @@ class QuietResult(NamedTuple):
     """Result of trirail.control.cycle.observe, if the cycle stopped after that function."""
     code: int
     """Result of trirail.control.cycle.command, if the cycle stopped after that function."""
+
+    @property
+    def tick(self) -> Tick:
+        """Tick of the cycle."""
+        return Tick(self.deadline_ns, self.lateness_ns, self.missed)
+
+
+class _Copies:
+    """Copies of arrays for compiled code. Only bytes are copied, whatever the type of an array."""
+
+    def __init__(self) -> None:
+        self._pairs: list[tuple[NDArray[np.uint8], NDArray[np.uint8]]] = []
+
+    def add(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Add an array, and return its copy."""
+        copy = array.copy()
+        self._pairs.append((_bytes_of(array), _bytes_of(copy)))
+        return copy
+
+    def copy_in(self) -> None:
+        """Copy the arrays to their copies."""
+        for array, copy in self._pairs:
+            copy[:] = array
+
+    def copy_back(self) -> None:
+        """Copy the copies to their arrays."""
+        for array, copy in self._pairs:
+            array[:] = copy
+
+
+def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
+    return array.reshape(-1).view(np.uint8)
 
 
 class QuietCycles:
@@ -85,7 +131,14 @@ class QuietCycles:
         self._motion: tuple[Any, ...] = ()
         """Arguments of the compiled function, valid until the drives lend other tables or the motion changes."""
         self._nothing = np.zeros(1)
+        self._companion = Companion()
+        self.due = _NO_CYCLE
+        """Cycle after which the control must decide, and not later."""
+        self.lead = 0
+        """Number of cycles before `due` at which the compiled call returns, so that the decision can be made ahead."""
         measured, setpoints = control.measured, control.setpoints
+        self._measured, self._commanded, self._furthest = _Copies(), _Copies(), _Copies()
+        self._robot = self._robot_arrays()
         state = self._state
         self.parts_ns = state.parts_ns
         """Durations of the parts of the newest cycle [ns], in the memory to which compiled code writes."""
@@ -95,16 +148,26 @@ class QuietCycles:
         state.report_after, state.busy_wait_ns = control.outputs.report_after, busy_wait_ns
 
     def run(
-        self, ticker: Ticker, overruns: Overruns, spare_ns: int, *, listens: bool, once: bool
+        self,
+        ticker: Ticker,
+        overruns: Overruns,
+        spare_ns: int,
+        work: Callable[[], None] | None = None,
+        *,
+        listens: bool,
+        once: bool,
     ) -> QuietResult | None:
         """Run cycles until an event or the end of a batch, and return the result for the newest cycle.
 
-        Return None if no cycle was run, because Python must run the next cycle.
+        Return None if no cycle was run, because Python must run the next cycle. Otherwise call `conclude`, or decide
+        ahead.
 
         Parameters
         ----------
         spare_ns
             Time before a tick in which calls are not served [ns].
+        work
+            Work beside the cycles that changes neither the control nor the drives.
         listens
             True if a call during the wait for the first tick must be served before that tick.
         once
@@ -114,32 +177,152 @@ class QuietCycles:
         control, state = self._control, self._state
         if not ((once or self._reports.idle) and self._gateway.no_peer_lost and self._tables_ready()):
             self.leave()
+            if work is not None:
+                work()
             return None
-        watch, before = self._watch, control.cycles
-        state.injected_ns, state.deadline_ns = ticker.sleep_if_injected(), ticker.deadline_ns
-        state.overruns, state.in_a_row, state.allowed = overruns.all, overruns.in_a_row, overruns.allowed
-        state.until = before + (1 if once or state.injected_ns >= 0 else max(1, self._reports.due_after))
-        state.batched, state.listens, state.spare_ns = self._reports.batched, listens, spare_ns
-        state.gateway_seen, state.gateway_turns = watch.seen, watch.silent_turns
-        state.urgent_seen = self._urgent_flag.seen
+        state.injected_ns = ticker.sleep_if_injected()
+        state.until = control.cycles + (1 if once or state.injected_ns >= 0 else max(1, self._reports.due_after))
+        state.beside, state.listens, state.spare_ns = False, listens, spare_ns
         state.logged, state.report_due = control.outputs.logged, control.outputs.report_due
         self._poll_set.refresh()
-        reached = Reached(quiet.run(*self._tables, *self._motion))
+        self._copy_in()
+        reached = self._call_beside(work, ticker, overruns)
+        self.copy_back()
+        control.outputs.update_log(state.logged, state.report_due)
+        self.leave_at(reached)
+        control.resume(state.cycle, state.time, None)
+        if reached is Reached.WRITTEN:
+            self.send_on()
+        return self.result(reached)
+
+    def run_beside(self, ticker: Ticker, overruns: Overruns, number: int, work: Callable[[], None]) -> QuietResult:
+        """Run `number` cycles while `work` runs in another thread, in which the control foresees and decides.
+
+        Return the result for the newest cycle. The cycles end early at a stage that needs Python. Call this only after
+        `run`, if `runs_beside` is True, and then `copy_measured_back`, or `copy_back` if the control is taken back.
+        """
+        state = self._state
+        last = state.cycle + number
+        state.beside, state.listens, state.until = True, False, last
+        if state.injected_ns < 0:
+            return self.result(self._call_beside(work, ticker, overruns))
+        work()  # before the cycles or beside them: the result is the same
+        reached = Reached.DONE
+        while reached is Reached.DONE and state.cycle < last:
+            state.injected_ns, state.until = ticker.sleep_if_injected(), state.cycle + 1
+            reached = self._call(ticker, overruns)
+        return self.result(reached)
+
+    def _call_beside(self, work: Callable[[], None] | None, ticker: Ticker, overruns: Overruns) -> Reached:
+        """Call the compiled function beside `work`."""
+        if work is None:
+            return self._call(ticker, overruns)
+        if self._state.injected_ns >= 0 or self._calls_python:
+            work()
+            return self._call(ticker, overruns)
+        with self._companion.working(work):
+            return self._call(ticker, overruns)
+
+    def _call(self, ticker: Ticker, overruns: Overruns) -> Reached:
+        """Call the compiled function, and return the stage that it has reached."""
+        state, watch, before = self._state, self._watch, self._state.cycle
+        state.deadline_ns, state.batched = ticker.deadline_ns, self._reports.batched
+        state.overruns, state.in_a_row, state.allowed = overruns.all, overruns.in_a_row, overruns.allowed
+        state.gateway_seen, state.gateway_turns = watch.seen, watch.silent_turns
+        state.urgent_seen = self._urgent_flag.seen
+        first, moment, *rest = self._tables
+        reached = Reached(quiet.run(first, moment, self._neighbours(), *rest, *self._motion))
         overruns.all, overruns.in_a_row = state.overruns, state.in_a_row
         watch.seen, watch.silent_turns = state.gateway_seen, state.gateway_turns
         self._reports.batched, ticker.deadline_ns = state.batched, state.deadline_ns
         self.cycles += state.cycle - before
-        control.outputs.update_log(state.logged, state.report_due)
+        return reached
+
+    def result(self, reached: Reached) -> QuietResult:
+        """Return the result for the newest cycle, which has reached a stage."""
+        state = self._state
         decides = state.decides and reached in (Reached.WRITTEN, Reached.DONE)
+        self._drives.next_sync = (state.deadline_ns + state.period_ns) * 1e-9  # for commands at the end of a motion
+        tick = state.deadline_ns, state.lateness_ns, state.missed
+        return QuietResult(
+            reached, state.cycle, *tick, state.marked_ns, state.called, decides, state.behind, state.code
+        )
+
+    def leave_at(self, reached: Reached) -> None:
+        """Return lent tables to the drives, if the newest cycle has reached a stage that needs Python."""
+        state = self._state
         if reached not in (Reached.DONE, Reached.CALLED):
             synced = state.synced if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
             self.leave(state.handled, state.arrived, synced=synced, error=max(state.error, 0))
-        self._drives.next_sync = (state.deadline_ns + state.period_ns) * 1e-9  # for commands at the end of a motion
-        control.resume(state.cycle, state.time, state.code if decides else None)
-        if reached is Reached.WRITTEN:
-            self._drives.send_on(state.sent)
-        tick = state.deadline_ns, state.lateness_ns, state.missed
-        return QuietResult(reached, *tick, state.marked_ns, state.called, decides, state.behind, state.code)
+
+    def conclude(self, newest: QuietResult) -> None:
+        """Let the control evaluate the newest cycle, if it must react to that cycle."""
+        if newest.decides:
+            self._control.resume(newest.cycle, self._state.time, newest.code)
+
+    def send_on(self) -> None:
+        """Let the drives send the setpoints again that the bus has refused."""
+        self._drives.send_on(self._state.sent)
+
+    def solve(self, feedback: Feedback, tick: Tick) -> Reached:
+        """Evaluate the feedback of a cycle that Python has begun, and compute its setpoints; return the stage."""
+        state = self._state
+        state.deadline_ns, state.lateness_ns, state.missed = tick
+        self._control.measured.feedback = feedback
+        pack_feedback(feedback, self._robot.feedback)
+        first, moment, frames, robot = self._tables
+        reached = quiet.solve(first, moment, frames, robot, self._motion[0])
+        return Reached.SOLVED if reached == quiet.CONTINUE else Reached(reached)
+
+    def is_refused(self, reached: Reached) -> bool:
+        """Return True if a following error exceeds its limit, or the last gate has refused the setpoints."""
+        return reached is Reached.OBSERVED or bool(cycle.refusal(self._state.code))
+
+    @property
+    def setpoints(self) -> tuple[Triple, Triple]:
+        """Setpoints of the newest cycle: positions [m] and velocities [m/s]."""
+        (a, b, c), (u, v, w) = self._robot.sliders[0, :2].tolist()
+        return (a, b, c), (u, v, w)
+
+    def record(self, overruns: Overruns) -> int:
+        """Append the record of the newest cycle to the batch, and return the number of the cycle."""
+        state = self._state
+        state.overruns, state.batched = overruns.all, self._reports.batched
+        number = int(quiet.record(self._tables[0], self._robot, self._reports.batch))
+        self._reports.batched = state.batched
+        return number
+
+    @property
+    def runs_beside(self) -> bool:
+        """True if Python may decide beside the next cycles.
+
+        They then execute a motion or hold the robot, there is no other motion to follow, and there are no outputs.
+        Compiled code must not need Python to exchange frames.
+        """
+        if self._lent is None or self._state.source == quiet.FOLLOW or len(self._control.schedule.runs) > 1:
+            return False
+        return not (self._control.outputs.any or self._calls_python)
+
+    @property
+    def _calls_python(self) -> bool:
+        """True if Python exchanges the frames for compiled code, unless the clock is injected."""
+        return self._state.injected_ns < 0 and (self._lent is None or bool(self._lent.bus[0] < 0))
+
+    def _copy_in(self) -> None:
+        for copies in (self._measured, self._commanded, self._furthest):
+            copies.copy_in()
+
+    def copy_measured_back(self) -> None:
+        """Copy the measured state of the robot back from compiled code."""
+        self._measured.copy_back()
+
+    def copy_back(self) -> None:
+        """Copy the whole state of the robot back from compiled code."""
+        for copies in (self._measured, self._commanded, self._furthest):
+            copies.copy_back()
+
+    def _neighbours(self) -> quiet.Neighbours:
+        return quiet.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
 
     def leave(self, handled: int = 0, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Return lent tables to the drives, with the parameters of trirail_drivers.driver.cyclic.Lender.reclaim."""
@@ -178,7 +361,8 @@ class QuietCycles:
         state.source = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
         state.cycle, state.mode = self._control.cycles, MODES.index(self._control.state.mode)
         state.held, state.at_rest, state.code = steady.held, steady.at_rest, steady.code
-        state.due = int(min(max(steady.until, state.cycle), _NO_CYCLE))
+        self.due = int(min(max(steady.until, state.cycle), _NO_CYCLE))
+        state.due = max(state.cycle, self.due - (self.lead if self.runs_beside else 0))
         state.settles, state.timeout = steady.settles_by is not None, steady.settles_by or 0
         runs = self._control.schedule.runs
         state.time = runs[0].time if runs else 0.0
@@ -187,7 +371,6 @@ class QuietCycles:
 
     def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
         """Return the arguments of the compiled function that stay the same while the drives lend their tables."""
-        measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
         frames = quiet.FrameTables(
             bus=lent.bus,
             arrived=lent.arrived.frames,
@@ -205,28 +388,33 @@ class QuietCycles:
             times=lent.times,
             history=lent.history,
         )
-        robot = quiet.RobotArrays(
+        return np.frombuffer(memoryview(self._state), STATE), self._moment, frames, self._robot
+
+    def _robot_arrays(self) -> quiet.RobotArrays:
+        """Return copies of the control's arrays for compiled code."""
+        measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
+        record, commanded = self._measured.add(measured.record), self._commanded.add
+        return quiet.RobotArrays(
             legs=measured.legs,
-            bounds=setpoints.bounds,
-            motion=schedule.motion,
-            sliders=setpoints.sliders,
-            backlash=measured.backlash,
-            refused_values=setpoints.refused_values,
-            feedback=measured.numbers,
-            written=measured.written,
-            jumps=measured.jumping,
-            scratch=measured.scratch,
-            monitored=measured.settling.monitored,
-            record=measured.record,
-            packed=measured.record.view(np.uint8),
+            bounds=commanded(setpoints.bounds),
+            motion=commanded(schedule.motion),
+            sliders=commanded(setpoints.sliders),
+            backlash=commanded(measured.backlash),
+            refused_values=commanded(setpoints.refused_values),
+            feedback=self._measured.add(measured.numbers),
+            written=self._measured.add(measured.written),
+            jumps=self._measured.add(measured.jumping),
+            scratch=self._measured.add(measured.scratch),
+            monitored=self._measured.add(measured.settling.monitored),
+            record=record,
+            packed=record.view(np.uint8),
         )
-        neighbours = quiet.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
-        return np.frombuffer(memoryview(self._state), STATE), self._moment, neighbours, frames, robot
 
     def _motion_arguments(self, run: Run | None) -> tuple[quiet.MotionArrays, quiet.OutputArrays]:
         """Return the arguments of the compiled function that depend on the motion."""
         path, law = (run.path, run.law) if run is not None else (_EMPTY_PATH, _IDLE_LAW)
-        furthest = run.furthest if run is not None else self._nothing
+        self._furthest = _Copies()
+        furthest = self._furthest.add(run.furthest if run is not None else self._nothing)
         outputs = self._control.outputs
         outputs.prepare(run, self._control.schedule.version)
         motion = quiet.MotionArrays(path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest)

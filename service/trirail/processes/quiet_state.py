@@ -94,6 +94,8 @@ class QuietState(ctypes.Structure):
     """Cycle at which that wait times out."""
 
     # The neighbours
+    beside: bool
+    """Whether Python decides beside the cycles, so that calls, other decisions and a lost gateway wait."""
     listens: bool
     """Whether a call during the wait for the next tick is served immediately."""
     urgent_seen: Unsigned

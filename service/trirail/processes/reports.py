@@ -90,8 +90,10 @@ class Reports:
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._made = control.measured.record.view(np.uint8).data
         """Bytes of the newest cycle's record, which the control fills."""
-        self._batch = memoryview(bytearray(1 + self._batch_size * SIZE))
-        self._batch[0] = Kind.RECORDS
+        self._batch, self._spare = (memoryview(bytearray(1 + self._batch_size * SIZE)) for _ in range(2))
+        self._batch[0] = self._spare[0] = Kind.RECORDS
+        self._unsent_batch: memoryview | None = None
+        """Filled part of a batch that was set aside; it is sent before the records of the present batch."""
         self.batched = 0
         """Number of records in the batch."""
         self._recorded = False
@@ -150,6 +152,11 @@ class Reports:
         """True if the recorder was lost and `listen` has not announced that yet."""
         return not self._recorder.no_peer_lost
 
+    def set_batch_aside(self) -> None:
+        """Begin another batch, so that the records of this one can be sent while cycles are run."""
+        self._unsent_batch = self._batch[: 1 + self.batched * SIZE] if self.batched else None
+        self._batch, self._spare, self.batched = self._spare, self._batch, 0
+
     def pass_on(self) -> None:
         """Send the inputs to the control, then the events and the answers, if there are any.
 
@@ -168,11 +175,12 @@ class Reports:
     def flush(self) -> None:
         """Send the batch of records and captured frames, accept new peers, and send events that have not been sent."""
         self._send_inputs()
-        if self.batched:
-            batch = self._batch[: 1 + self.batched * SIZE]
-            self.batched = 0
-            self._gateway.send(batch)
-            self._recorder.send(batch)
+        if self._unsent_batch is None and self.batched:
+            self.set_batch_aside()
+        if self._unsent_batch is not None:
+            self._gateway.send(self._unsent_batch)
+            self._recorder.send(self._unsent_batch)
+            self._unsent_batch = None
         if self._capture is not None and self._recorder.connected:
             for frames in self._capture.drain():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)

@@ -6,7 +6,7 @@ Each line contains a text for people and the message itself as JSON for programs
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,6 +24,7 @@ from trirail.wire.packets import (
     CheckRequest,
     CommandRequest,
     ControlInput,
+    DecidedAhead,
     Disturbance,
     DrivesFault,
     GoalRequest,
@@ -35,7 +36,9 @@ EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
 JSON, WORDS = rr.ComponentDescriptor("json"), rr.ComponentDescriptor("words")
 """Components in addition to the text that a viewer shows: the message as JSON, and the text without its time."""
-LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+LogLevel = Level | Literal["trace"]
+"""Level of a log entry; a trace helps only to replay the recording."""
+LEVELS: dict[LogLevel, str] = {"trace": "TRACE", "info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
 class Entry(NamedTuple):
@@ -48,7 +51,7 @@ class Entry(NamedTuple):
     wall: float
     """Wall clock [s since 1970]."""
     text: str
-    level: Level = "info"
+    level: LogLevel = "info"
     message: Event | ControlInput | None = None
     """The message itself; None for a line from the recorder."""
 
@@ -74,7 +77,8 @@ def event_entry(event: Event) -> Entry:
 def input_entry(item: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
     """Return the log entry of a control input, at the nominal time of the cycle that handled the input."""
     wall = (item.now_ns + wall_offset_ns) / SECOND
-    return Entry(REQUESTS, item.cycle / rate_hz, wall, _input_text(item), message=item)
+    level: LogLevel = "trace" if isinstance(item.given, DecidedAhead) else "info"
+    return Entry(REQUESTS, item.cycle / rate_hz, wall, _input_text(item), level, item)
 
 
 def chunks(entries: Sequence[Entry]) -> list[Chunk]:
@@ -125,5 +129,7 @@ def _input_text(item: ControlInput) -> str:
             return f"plan {number}: {message}"
         case PlannerLost(reason=reason):
             return reason
+        case DecidedAhead(cycles=cycles):
+            return f"decided {cycles} cycles ahead"
         case Announcement(notice):
             return notice.message

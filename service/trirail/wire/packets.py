@@ -182,6 +182,13 @@ class DrivesFault(Struct, frozen=True, tag=True):
     """Names of the drives that cannot be reset yet."""
 
 
+class DecidedAhead(Struct, frozen=True, tag=True):
+    """Input of the control that it decides while the next cycles run, so that its decisions take effect after them."""
+
+    cycles: int
+    """Number of these cycles; 0 if a fault in the present cycle ends them."""
+
+
 class PlannerLost(Struct, frozen=True, tag=True):
     """Input of the control that the planner will not answer a request, because the planner has died or does not run."""
 
@@ -189,7 +196,7 @@ class PlannerLost(Struct, frozen=True, tag=True):
 
 
 Request = GoalRequest | CheckRequest | CommandRequest | Announcement
-GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost
+GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost | DecidedAhead
 
 
 class ControlInput(Struct, frozen=True, tag="Input"):  # recordings contain this tag

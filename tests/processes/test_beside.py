@@ -1,0 +1,159 @@
+"""Decisions beside the cycles: generated sessions keep their motion, and are replayed to the last bit."""
+
+from __future__ import annotations
+
+import random
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from control_rig import carried
+from numpy.typing import NDArray
+from processes.test_quiet import CONFIGS, CYCLES, Happening, Session, requests_of_two, script
+from trirail.analysis import replay
+from trirail.config import Config
+from trirail.control.control import Control
+from trirail.processes.quiet import Reached
+from trirail.wire.packets import CommandRequest, ControlInput, DecidedAhead, EventReport, Kind, decode_answer
+from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import MODES, Command, Mode
+from trirail_drivers.bus.can_frame import CAN_FRAME
+
+REFUSED = re.compile("no setpoint|setpoint refused")
+"""What the last gate says."""
+
+
+def recorded(
+    session: Session, happens: dict[int, list[Happening]], cycles: int
+) -> tuple[NDArray[np.void], list[ControlInput], list[EventReport]]:
+    """Run a session; return its records, its inputs and its events."""
+    packets: list[bytes] = []
+    receive = session.recorder.receive
+
+    def keep() -> bytes | None:
+        if (packet := receive()) is not None:
+            packets.append(bytes(packet))
+        return packet
+
+    session.recorder.receive = keep  # type: ignore[method-assign]
+    session.run(happens, cycles)
+    session.loop._flush()
+    while keep() is not None:
+        pass
+    rows = b"".join(packet[1:] for packet in packets if packet[0] == Kind.RECORDS)
+    said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
+    inputs = [each for each in said if isinstance(each, ControlInput)]
+    return np.frombuffer(rows, DTYPE), inputs, [each for each in said if isinstance(each, EventReport)]
+
+
+def replayed(config: Config, records: NDArray[np.void], inputs: list[ControlInput]) -> NDArray[np.bool]:
+    """Return for each cycle whether its replay differs from what was recorded."""
+    drives, planner = replay._RecordedDrives(records), replay._RecordedPlanner(config)
+    clock = replay._SimulatedClock(config.period)
+    control = Control(config, drives, planner)
+    setpoints, modes, _ = replay._run(control, drives, planner, clock, records, inputs)
+    told = np.stack([records[name] for name in replay.SETPOINT_FIELDS], axis=1)
+    differs = (setpoints.view(np.int64) != told.view(np.int64)).any(axis=(1, 2))
+    result: NDArray[np.bool] = differs | (modes != records["mode"])
+    return result
+
+
+@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize(
+    ("protocol", "seed"),
+    [*(("cia402", seed) for seed in range(6)), *(("odrive", seed) for seed in range(2)), ("two", 1)],
+)
+def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last_bit(
+    protocol: str, seed: int, number: int, tmp_path: Path
+) -> None:
+    config = CONFIGS.get(protocol, CONFIGS["cia402"])
+    session = Session(config, tmp_path, "unix", quiet=True)
+    session.loop.beside = number, number
+    happens = requests_of_two(seed) if protocol == "two" else script(seed, protocol)
+    try:
+        records, inputs, events = recorded(session, happens, CYCLES)
+    finally:
+        session.close()
+    ahead = [each.given.cycles for each in inputs if isinstance(each.given, DecidedAhead)]
+    assert ahead.count(number) > 10
+    assert np.array_equal(records["cycle"], np.arange(1, len(records) + 1))
+    assert not [each.event.message for each in events if REFUSED.search(each.event.message)]
+    differs = replayed(config, records, inputs)
+    first = int(np.argmax(differs))
+    assert not differs.any(), (
+        first + 1,
+        MODES[records["mode"][first]],
+        [each for each in inputs if abs(each.cycle - first) < 5],
+    )
+
+
+MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
+    "a strange frame": lambda session, _: session.inject(CAN_FRAME.pack(0x123, 2, b"ab")),
+    "a statusword": lambda session, chance: session.inject(
+        CAN_FRAME.pack(0x181 + chance.randrange(3), 2, struct.pack("<H", chance.choice((0x1637, 0x0637))))
+    ),
+    "a frame of wrong length": lambda session, chance: session.inject(
+        CAN_FRAME.pack(0x281 + chance.randrange(3), 3, struct.pack("<i", 5))
+    ),
+    "a fault": lambda session, chance: session.drives.faults.add(f"{chance.choice('ABC')} fault 2310"),
+    "silence": lambda session, chance: session.drives.faults.add(f"{chance.choice('ABC')} silent for 0.004"),
+    "late frames": lambda session, _: setattr(session, "holds", True),
+    "a full bus": lambda session, chance: setattr(session, "room", chance.randrange(4)),
+    "a stop": lambda session, _: session.ask(CommandRequest(8000, "ann", Command.STOP, carried(Command.STOP))),
+    "a quick stop": lambda session, _: session.ask(CommandRequest(8000, "ann", Command.QUICK_STOP)),
+    "a late tick": lambda session, chance: setattr(session, "late_ns", chance.choice((300_000, 900_000, 2_500_000))),
+}
+"""What happens while cycles run beside a decision."""
+
+
+@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("mishap", MISHAPS)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
+    mishap: str, number: int, seed: int, tmp_path: Path
+) -> None:
+    """The cycles that were under way go on with the motion from before the decision, or a fault ends them."""
+    config, chance = CONFIGS["cia402"], random.Random(seed)
+    session = Session(config, tmp_path, "unix", quiet=True)
+    session.loop.beside = number, number
+    quiet = session.loop._quiet
+    assert quiet is not None
+    run_beside, happened, began = quiet.run_beside, [], []
+
+    def ambushed(*arguments: Any) -> Any:
+        if chance.random() < 0.2:
+            MISHAPS[mishap](session, chance)
+            began.append(session.loop.control.cycles)
+            happened.append((newest := run_beside(*arguments)).reached)
+            return newest
+        return run_beside(*arguments)
+
+    quiet.run_beside = ambushed  # type: ignore[assignment, method-assign]
+    happens = script(seed)
+    for at in range(200, CYCLES, 120):
+        for later, name in enumerate((Command.RESET, Command.ENABLE)):
+            request = CommandRequest(9000 + at + later, "ann", name)
+            happens.setdefault(at + 15 * later, []).append(
+                Happening(lambda session, request=request: session.ask(request))  # type: ignore[misc]
+            )
+    try:
+        records, inputs, events = recorded(session, happens, CYCLES)
+    finally:
+        session.close()
+    assert len(happened) > 3
+    assert np.array_equal(records["cycle"], np.arange(1, len(records) + 1))
+    assert not [each.event.message for each in events if REFUSED.search(each.event.message)]
+    differs = replayed(config, records, inputs)
+    assert not differs.any(), (int(np.argmax(differs)) + 1, mishap)
+    for cycle in began:
+        modes = [MODES[each] for each in records["mode"][cycle : cycle + 3]]
+        if mishap == "a quick stop":
+            assert modes[0] is Mode.FAULT
+        elif mishap == "a stop":
+            assert len(modes) < 3 or modes[2] is not Mode.MOVING
+    if mishap not in ("a late tick", "late frames", "silence"):
+        assert {*happened} - {Reached.DONE}, "some of it needed Python"
