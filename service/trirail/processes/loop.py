@@ -177,7 +177,7 @@ class Loop:
         elif quiet is not None:
             quiet.leave()
         if newest is None and self._work is not None:
-            self._flush()
+            self._work()
             self._work = None
         if newest is None and not self._listened and ticker.listen(self._poll_set, self._call_budget.ns):
             self._serve_call(ticker)
@@ -197,26 +197,29 @@ class Loop:
             self._follow_up(quiet, ticker, newest)
 
     def _follow_up(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult) -> None:
-        """Do the work that is due after a complete cycle, either before the next tick or beside the next cycles."""
+        """Decide after a complete cycle, if that is due, either before the next tick or beside the next cycles.
+
+        Messages and records are sent beside the next cycles.
+        """
         reports, next_ns = self._reports, newest.deadline_ns + self._period_ns
-        if newest.called or newest.decides or self._postponed or reports.misses_recorder:
-            if number := self._cycles_beside(quiet, newest, next_ns):
-                self._decide_ahead(quiet, ticker, newest, number)
-                return
+        decides = newest.called or newest.decides or self._inputs_postponed or reports.misses_recorder
+        number = self._cycles_beside(quiet, newest, next_ns) if decides else 0
+        if flushes := reports.due_after <= number:
+            reports.set_batch_aside()
+        if number:
+            self._decide_ahead(quiet, ticker, newest, number)
+        elif decides:
             began_ns = self._now()
             quiet.conclude(newest)
-            if not reports.due_after:
-                self._flush_beside()
             self._decide(next_ns, called=newest.called, due=newest.decides)
             self._beside_budget.note(self._now() - began_ns)
             quiet.add(Part.DECIDE)
-        elif not reports.due_after:
-            self._flush_beside()
+        if decides or flushes or self._reports_postponed:
+            self._work = self._send_and_flush if flushes else self._send_reports
 
-    def _flush_beside(self) -> None:
-        """Send the batch of records beside the next cycles."""
-        self._reports.set_batch_aside()
-        self._work = self._flush
+    def _send_and_flush(self) -> None:
+        self._send_reports()
+        self._flush()
 
     def _cycles_beside(self, quiet: QuietCycles, newest: QuietResult, next_ns: int) -> int:
         """Return the number of cycles that must run beside a decision, so that none of them is late.
@@ -239,20 +242,15 @@ class Loop:
 
     def _decide_ahead(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, number: int) -> None:
         """Decide beside the next `number` cycles."""
-        control, reports, began_ns = self.control, self._reports, self._now()
+        control, began_ns = self.control, self._now()
         next_ns = newest.deadline_ns + (number + 1) * self._period_ns
-        if flushes := reports.due_after <= number:
-            reports.set_batch_aside()
 
         def work() -> None:
-            reports.note(next_ns, DecidedAhead(number))
+            self._reports.note(next_ns, DecidedAhead(number))
             control.foresee(number)
             if newest.called:
                 self._read()
             self._pass_to_control(self._noted(next_ns))
-            self._send_reports()
-            if flushes:
-                self._flush()
             self._beside_budget.note(self._now() - began_ns)
 
         control.modes.hold_commands()
@@ -349,6 +347,7 @@ class Loop:
         self._reports.pass_on()
         self.control.conclude()
         self._decide(next_ns)
+        self._send_before(next_ns)
         self._mark(Part.DECIDE)
 
     def _handle_urgent(self, inputs: Iterable[Request | Disturbance], now_ns: int) -> None:
@@ -396,14 +395,19 @@ class Loop:
             self._pass_to_control(self._noted(next_ns) if in_time else ())
             if in_time:
                 self._decision_budget.note(self._now() - began_ns)
-        if called or due or waited or self._reports_postponed or self._reports.misses_recorder:
-            began_ns = self._now()
-            if self._reports_postponed or next_ns - began_ns >= self._report_budget.ns:
-                self._send_reports()
-                self._report_budget.note(self._now() - began_ns)
-            else:
-                self._reports_postponed = True
-                self._reports.postpone()
+
+    def _send_before(self, next_ns: int) -> None:
+        """Send events and answers, and the batch of records if it is due, before the next tick.
+
+        If too little time is left, that is postponed once, until the setpoints of the next cycle have been sent.
+        """
+        began_ns = self._now()
+        if self._reports_postponed or next_ns - began_ns >= self._report_budget.ns:
+            self._send_reports()
+            self._report_budget.note(self._now() - began_ns)
+        else:
+            self._reports_postponed = True
+            self._reports.postpone()
         if not self._reports.due_after:
             began_ns = self._now()
             if self._reports.full or next_ns - began_ns >= self._flush_budget.ns:
