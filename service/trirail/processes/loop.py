@@ -43,8 +43,11 @@ If less time is left, the next cycle serves the call.
 """
 LONGEST_CALL = 0.9
 """Limit of that time, as a fraction of the period, above which it would never be measured again."""
-HANDOVER_NS = 200_000
-"""Time for handing over to the thread that decides beside the cycles, and for preparing the next motion [ns]."""
+HANDOVER_NS = 500_000
+"""Time for handing over to the thread that decides beside the cycles, and for preparing the next motion [ns].
+
+A decision follows many cycles of compiled code, so that the caches of the processor no longer hold Python's code.
+"""
 MOST_AHEAD = 2
 """Maximum number of cycles by which a decision is made ahead. A stop that is not a quick stop waits for their end."""
 BUDGET_DECAY = 1 / 32
