@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from control_rig import carried
+from msgspec import structs
 from numpy.typing import NDArray
 from processes.test_quiet import CONFIGS, CYCLES, Happening, Session, requests_of_two, script
 from trirail.analysis import replay
@@ -89,6 +90,27 @@ def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last
         MODES[records["mode"][first]],
         [each for each in inputs if abs(each.cycle - first) < 5],
     )
+
+
+@pytest.mark.parametrize("rate", [20, 50, 100, 250])
+def test_no_more_cycles_run_beside_a_decision_than_a_batch_has_records(rate: int, tmp_path: Path) -> None:
+    """At a low rate, a batch has few records, and compiled code must not write behind its end."""
+    config = CONFIGS["cia402"]
+    config = structs.replace(config, loop=structs.replace(config.loop, rate_hz=rate))
+    session = Session(config, tmp_path, "unix", quiet=True)
+    most = session.loop.beside[1]
+    session.loop.beside = most, most
+    size = session.loop._reports.batch_size
+    try:
+        records, inputs, events = recorded(session, script(3), CYCLES)
+    finally:
+        session.close()
+    assert most == min(2, size)
+    assert [each for each in inputs if isinstance(each.given, DecidedAhead)]
+    assert np.array_equal(records["cycle"], np.arange(1, len(records) + 1))
+    assert len(records) > 0.9 * CYCLES
+    assert not [each.event.message for each in events if REFUSED.search(each.event.message)]
+    assert not replayed(config, records, inputs).any()
 
 
 MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {

@@ -138,7 +138,7 @@ class Loop:
         if quiet and isinstance(drives, Lender):
             beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
             self._quiet = QuietCycles(self.control, drives, *beside, config.loop.busy_wait_ns)
-        self.beside = 0, MOST_AHEAD
+        self.beside = 0, min(MOST_AHEAD, self._reports.batch_size)
         """Minimum and maximum number of cycles that run beside a decision, which tests change."""
         self._fault: DriveFault | None = None
         self._unready: tuple[str, ...] = ()
@@ -211,6 +211,8 @@ class Loop:
             reports.set_batch_aside()
         if number:
             self._decide_ahead(quiet, ticker, newest, number)
+            if reports.full:
+                reports.set_batch_aside()
         elif decides:
             began_ns = self._now()
             quiet.conclude(newest)

@@ -87,10 +87,11 @@ class Reports:
         self._unsent_inputs: list[ControlInput] = []
         self._postponed = 0, 0
         """Number of waiting events that belong to an earlier cycle than later events, and the number of that cycle."""
-        self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
+        self.batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
+        """Maximum number of records in a batch."""
         self._made = control.measured.record.view(np.uint8).data
         """Bytes of the newest cycle's record, which the control fills."""
-        self._batch, self._spare = (memoryview(bytearray(1 + self._batch_size * SIZE)) for _ in range(2))
+        self._batch, self._spare = (memoryview(bytearray(1 + self.batch_size * SIZE)) for _ in range(2))
         self._batch[0] = self._spare[0] = Kind.RECORDS
         self._unsent_batch: memoryview | None = None
         """Filled part of a batch that was set aside; it is sent before the records of the present batch."""
@@ -130,12 +131,12 @@ class Reports:
     @property
     def due_after(self) -> int:
         """Number of cycles after which the batch is due to be sent; 0 if it is due now."""
-        return max(0, self._batch_size - self._batch_size // SPARE_SHARE - self.batched)
+        return max(0, self.batch_size - self.batch_size // SPARE_SHARE - self.batched)
 
     @property
     def full(self) -> bool:
         """True if the batch has no space for another record, and must be sent."""
-        return self.batched == self._batch_size
+        return self.batched == self.batch_size
 
     @property
     def idle(self) -> bool:
@@ -154,6 +155,8 @@ class Reports:
 
     def set_batch_aside(self) -> None:
         """Begin another batch, so that the records of this one can be sent while cycles are run."""
+        if self._unsent_batch is not None:
+            self.flush()
         self._unsent_batch = self._batch[: 1 + self.batched * SIZE] if self.batched else None
         self._batch, self._spare, self.batched = self._spare, self._batch, 0
 
