@@ -10,8 +10,12 @@ import pytest
 from trirail.processes.companion import Companion
 
 
+def no_answer() -> None:
+    raise AssertionError("nobody has asked")
+
+
 def test_work_runs_in_one_other_thread_while_the_body_runs() -> None:
-    companion, began, threads = Companion(), threading.Event(), list[int]()
+    companion, began, threads = Companion(no_answer), threading.Event(), list[int]()
 
     def work() -> None:
         threads.append(threading.get_native_id())
@@ -33,13 +37,13 @@ def test_the_body_is_left_when_the_work_is_done() -> None:
         time.sleep(0.05)
         done.append(True)
 
-    with Companion().working(work):
+    with Companion(no_answer).working(work):
         assert not done
     assert done == [True]
 
 
 def test_an_error_of_the_work_is_raised_and_the_thread_works_on() -> None:
-    companion, done = Companion(), list[bool]()
+    companion, done = Companion(no_answer), list[bool]()
 
     def fails() -> None:
         raise ValueError("wrong")
@@ -51,9 +55,32 @@ def test_an_error_of_the_work_is_raised_and_the_thread_works_on() -> None:
     assert done == [True]
 
 
+def test_it_answers_each_ring_of_its_doorbell_and_an_error_is_raised_by_the_wait() -> None:
+    answers = list[int]()
+
+    def answer() -> None:
+        answers.append(threading.get_native_id())
+        if len(answers) == 2:
+            raise ValueError("wrong")
+
+    companion, worked = Companion(answer), list[bool]()
+    companion.start()
+    for number in range(1, 4):
+        with companion.working(lambda: worked.append(True)):
+            os.eventfd_write(companion.doorbell, 1)
+        if number == 2:
+            with pytest.raises(ValueError, match="wrong"):
+                companion.wait()
+        else:
+            companion.wait()
+        assert (len(answers), len(worked)) == (number, number)
+    assert {*answers} == {answers[0]}
+    assert answers[0] != threading.get_native_id()
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may use SCHED_FIFO here")
 def test_its_priority_is_one_lower() -> None:
-    companion, seen = Companion(), list[tuple[int, int]]()
+    companion, seen = Companion(no_answer), list[tuple[int, int]]()
 
     def real_time() -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(3))

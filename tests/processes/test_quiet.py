@@ -389,7 +389,8 @@ def both_ways(
         place = folder / str(quiet)
         place.mkdir()
         session = Session(config, place, carrier, quiet=quiet)
-        session.loop.beside = 0, 0  # Python's cycles know no cycles beside a decision
+        if session.loop._quiet is not None:
+            session.loop._quiet.beside = 0, 0  # Python's cycles know no cycles beside a decision
         try:
             session.run(script(), cycles)
         finally:

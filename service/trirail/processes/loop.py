@@ -16,8 +16,8 @@ from trirail.control.modes import ModeEvent
 from trirail.processes.clock import Overruns, PollSet, Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
-from trirail.processes.quiet import Reached
-from trirail.processes.quiet_cycles import QuietCycles, QuietResult
+from trirail.processes.quiet import MOST_AHEAD, Reached
+from trirail.processes.quiet_cycles import DecisionRequest, QuietCycles, QuietResult
 from trirail.processes.reports import Reports
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.packets import (
@@ -43,13 +43,11 @@ If less time is left, the next cycle serves the call.
 """
 LONGEST_CALL = 0.9
 """Limit of that time, as a fraction of the period, above which it would never be measured again."""
-HANDOVER_NS = 500_000
-"""Time for handing over to the thread that decides beside the cycles, and for preparing the next motion [ns].
+HANDOVER_NS = 300_000
+"""Time for taking over the result of a decision beside the cycles, and for preparing the next motion [ns].
 
 A decision follows many cycles of compiled code, so that the caches of the processor no longer hold Python's code.
 """
-MOST_AHEAD = 2
-"""Maximum number of cycles by which a decision is made ahead. A stop that is not a quick stop waits for their end."""
 BUDGET_DECAY = 1 / 32
 """Fraction by which a budget shrinks each time the work takes less time than the budget."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
@@ -137,9 +135,7 @@ class Loop:
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
             beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
-            self._quiet = QuietCycles(self.control, drives, *beside, config.loop.busy_wait_ns)
-        self.beside = 0, min(MOST_AHEAD, self._reports.batch_size)
-        """Minimum and maximum number of cycles that run beside a decision, which tests change."""
+            self._quiet = QuietCycles(self.control, drives, *beside, config.loop.busy_wait_ns, self._decide_ahead)
         self._fault: DriveFault | None = None
         self._unready: tuple[str, ...] = ()
         self._marked_ns = 0
@@ -176,7 +172,8 @@ class Loop:
         if quiet is not None and not disturbed:
             spare_ns, once = self._call_budget.ns, self._postponed
             work, self._work = self._work, None
-            newest = quiet.run(ticker, self._overruns, spare_ns, work, listens=not self._listened, once=once)
+            budget_ns, listens = self._beside_budget.ns + HANDOVER_NS, not self._listened
+            newest = quiet.run(ticker, self._overruns, spare_ns, budget_ns, work, listens=listens, once=once)
         elif quiet is not None:
             quiet.leave()
         if newest is None and self._work is not None:
@@ -186,6 +183,8 @@ class Loop:
             self._serve_call(ticker)
         elif newest is None:
             self.cycle(ticker.wait())
+        elif quiet is not None and newest.ahead is not None:
+            self._finish_ahead(quiet, ticker, newest, newest.ahead)
         elif newest.reached is Reached.WAITED:
             self.cycle(ticker.tick())
         elif newest.reached is Reached.SYNCED:
@@ -197,72 +196,51 @@ class Loop:
             self._serve_call(ticker)
         elif quiet is not None:
             self._listened = self._never_listens
-            self._follow_up(quiet, ticker, newest)
+            self._follow_up(quiet, newest)
 
-    def _follow_up(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult) -> None:
-        """Decide after a complete cycle, if that is due, either before the next tick or beside the next cycles.
-
-        Messages and records are sent beside the next cycles.
-        """
-        reports, next_ns = self._reports, newest.deadline_ns + self._period_ns
-        decides = newest.called or newest.decides or self._inputs_postponed or reports.misses_recorder
-        number = self._cycles_beside(quiet, newest, next_ns) if decides else 0
-        if flushes := reports.due_after <= number:
-            reports.set_batch_aside()
-        if number:
-            self._decide_ahead(quiet, ticker, newest, number)
-            if reports.full:
-                reports.set_batch_aside()
-        elif decides:
+    def _follow_up(self, quiet: QuietCycles, newest: QuietResult) -> None:
+        """Decide before the next tick, if that is due after a complete cycle."""
+        next_ns = newest.deadline_ns + self._period_ns
+        decides = newest.called or newest.decides or self._inputs_postponed or self._reports.misses_recorder
+        if decides:
             began_ns = self._now()
             quiet.conclude(newest)
             self._decide(next_ns, called=newest.called, due=newest.decides)
             self._beside_budget.note(self._now() - began_ns)
             quiet.add(Part.DECIDE)
-        if decides or flushes or self._reports_postponed:
+        self._send_beside(reports=decides or self._reports_postponed)
+
+    def _send_beside(self, *, reports: bool) -> None:
+        """Send the batch of records, if it is due, and events and answers beside the next cycles."""
+        if flushes := not self._reports.due_after:
+            self._reports.set_batch_aside()
+        if reports or flushes:
             self._work = self._send_and_flush if flushes else self._send_reports
 
     def _send_and_flush(self) -> None:
         self._send_reports()
         self._flush()
 
-    def _cycles_beside(self, quiet: QuietCycles, newest: QuietResult, next_ns: int) -> int:
-        """Return the number of cycles that must run beside a decision, so that none of them is late.
-
-        A decision that is due in a certain cycle is made for exactly that cycle.
-        """
-        budget_ns = self._beside_budget.ns + HANDOVER_NS
-        quiet.lead = self._missing_cycles(budget_ns - self._period_ns)
-        if newest.reached is not Reached.DONE or not quiet.runs_beside:
-            return 0
-        number, until_due = self._missing_cycles(budget_ns - (next_ns - self._now())), quiet.due - newest.cycle
-        if until_due < 0:
-            return number
-        return until_due if newest.decides and until_due <= self.beside[1] else min(number, until_due)
-
-    def _missing_cycles(self, missing_ns: int) -> int:
-        """Return the number of cycles, at most MOST_AHEAD, that last for `missing_ns` [ns]."""
-        least, most = self.beside
-        return min(max(least, -(-missing_ns // self._period_ns)), most)
-
-    def _decide_ahead(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, number: int) -> None:
-        """Decide beside the next `number` cycles."""
-        control, began_ns = self.control, self._now()
-        next_ns = newest.deadline_ns + (number + 1) * self._period_ns
-
-        def work() -> None:
-            self._reports.note(next_ns, DecidedAhead(number))
-            control.foresee(number)
-            if newest.called:
-                self._read()
-            self._pass_to_control(self._noted(next_ns))
-            self._beside_budget.note(self._now() - began_ns)
-
+    def _decide_ahead(self, request: DecisionRequest) -> None:
+        """Decide beside the cycles of a request, in the thread beside compiled code."""
+        control, number = self.control, request.number
+        next_ns = request.deadline_ns + (number + 1) * self._period_ns
+        control.resume(request.cycle, request.time, None)
         control.modes.hold_commands()
-        last = quiet.run_beside(ticker, self._overruns, number, work)
-        self._finish_beside(quiet, ticker, last, newest.cycle + number)
-        control.modes.send_commands()
-        control.ahead = 0
+        self._reports.note(next_ns, DecidedAhead(number))
+        control.foresee(number)
+        if request.called:
+            self._read()
+        self._pass_to_control(self._noted(next_ns))
+        self._beside_budget.note(self._now() - request.requested_ns)
+
+    def _finish_ahead(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
+        """Let a decision take effect that was made beside the newest cycles, after cycle `last`."""
+        self._listened = self._never_listens
+        self._finish_beside(quiet, ticker, newest, last)
+        self.control.modes.send_commands()
+        self.control.ahead = 0
+        self._send_beside(reports=True)
 
     def _finish_beside(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
         """Finish the cycles beside which the control has decided, up to cycle `last`, if they have needed Python.

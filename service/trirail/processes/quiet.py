@@ -6,7 +6,10 @@ applies the last gate to the setpoints, and writes setpoints and record. The cal
 must be made before the setpoints are sent: if a drive sends anything other than its position, a request is urgent, a
 neighbour has disconnected, or the last gate refuses a setpoint. In these cases the call returns at the stage that it
 has reached, and Python continues from there. If other work is due, the call returns after the setpoints have been sent.
-While Python decides beside the cycles, other neighbours and other decisions wait.
+
+If a decision would take longer than the time before the next tick, the call does not return: the thread beside it
+(trirail.processes.companion) decides while the call runs one or two further cycles. Other neighbours and other
+decisions then wait.
 
 A signal does not end a wait. Python's signal handlers run when the call has returned, which is at the end of a batch of
 records at the latest.
@@ -18,7 +21,7 @@ from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba import f8, from_dtype, i8, types, u1, u8
+from numba import b1, f8, from_dtype, i4, i8, types, u1, u8, void
 from numpy.typing import NDArray
 from trirail_drivers.driver.cyclic import MOST_FRAMES
 
@@ -33,6 +36,7 @@ from trirail.processes.cycle_frames import (
     TIMINGS,
     begin_cycle,
     end_read,
+    memcpy,
     needs_python,
     process_frames,
     receive_frames,
@@ -44,6 +48,8 @@ from trirail.processes.heartbeats import URGENT_INDEX
 from trirail.processes.quiet_state import STATE
 from trirail.wire.records import MAX_PART_NS, Part
 
+MOST_AHEAD: Final = 2
+"""Maximum number of cycles by which a decision is made ahead. A stop that is not a quick stop waits for their end."""
 _PEER_GONE: Final = (0x008 | 0x010) << 16
 """POLLERR and POLLHUP of poll.h, shifted to the position of `revents` in a struct pollfd."""
 
@@ -77,6 +83,8 @@ FOLLOW, HOLD, COMMAND = 0, 1, 2
 """Sources of the setpoints: FOLLOW for the measured positions, HOLD for a platform at rest, COMMAND for a motion."""
 
 _STATE = from_dtype(STATE)[::1]
+_write: Any = types.ExternalFunction("write", types.intp(i4, types.intp, u8))
+"""Function of libc, resolved by name: unistd.h."""
 
 
 class FrameTables(NamedTuple):
@@ -227,7 +235,8 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
         s.deadline_ns -= s.period_ns
         s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
         return Reached.CALLED
-    s.listens, s.sent, s.called, s.decides = s.period_ns > s.spare_ns, 0, called(neighbours.pollfds), False
+    s.listens = s.period_ns > s.spare_ns and not s.beside
+    s.sent, s.called, s.decides = 0, called(neighbours.pollfds), False
     # The frames that have arrived answer the previous SYNC. Nothing is left to do between the deadline and SYNC.
     if not _receive(s, moment, frames, _now_ns(state, moment) / 1e9):
         return Reached.WAITED
@@ -324,7 +333,7 @@ def solve(
         )
     monitored = robot.monitored[0]
     in_position = s.settles and (monitored.inside >= monitored.dwell or s.cycle + 1 >= s.timeout)
-    s.decides, s.code = in_position or code != s.code or s.cycle + 1 >= s.due, code
+    s.decides, s.code = in_position or code != s.code or s.cycle + 1 >= s.due - s.lead, code
     late = _now_ns(state, moment) / 1e9 - s.synced > s.period
     if code >> 2 != 0 or late or not set_frames(frames.setpoints, frames.axes, robot.sliders[0]):
         return Reached.SOLVED
@@ -366,8 +375,59 @@ def record(state: NDArray[np.void], robot: RobotArrays, batch: NDArray[np.uint8]
     return int(s.cycle)
 
 
-@compiled(i8(_STATE, i8[::1], _NEIGHBOURS, _FRAME_TABLES, _ROBOT, _MOTION, _OUTPUTS), releases=True)
-def run(
+@compiled(void(i8[:, ::1], b1))
+def copy_state(copies: NDArray[np.int64], back: bool) -> None:
+    """Copy the control's arrays to the arrays of compiled code or, if `back` is set, from them.
+
+    Parameters
+    ----------
+    copies : (n, 3)
+        Address of each array of the control, address of the array of compiled code, and number of bytes.
+
+    """
+    for i in range(len(copies)):
+        source, target = (1, 0) if back else (0, 1)
+        memcpy(copies[i, target], copies[i, source], np.uint64(copies[i, 2]))
+
+
+@compiled()
+def _cycles_beside(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
+    """Return the number of cycles that must run beside a decision, so that none is late; 0 to decide before the next.
+
+    A decision that is due in a certain cycle is made for exactly that cycle.
+    """
+    s = state[0]
+    if s.most == 0:
+        return 0
+    missing_ns = s.budget_ns - (s.deadline_ns + s.period_ns - _now_ns(state, moment))
+    number, until_due = min(max(s.least, -(-missing_ns // s.period_ns)), s.most), s.due - s.cycle
+    if until_due < 0:
+        return int(number)
+    return int(until_due if s.decides and until_due <= s.most else min(number, until_due))
+
+
+@compiled()
+def _request_decision(
+    state: NDArray[np.void], moment: NDArray[np.int64], number: int, copies: NDArray[np.int64]
+) -> None:
+    """Let Python decide beside the next cycles, with the present state of the robot."""
+    s = state[0]
+    s.beside, s.listens, s.until = True, False, s.cycle + number
+    s.requested, s.requested_deadline_ns, s.requested_called, s.requested_time = (
+        s.cycle,
+        s.deadline_ns,
+        s.called,
+        s.time,
+    )
+    s.requested_ns = _now_ns(state, moment)
+    copy_state(copies, True)
+    if s.injected_ns < 0:
+        moment[0] = 1
+        _write(s.doorbell, moment.ctypes.data, np.uint64(8))
+
+
+@compiled()
+def _run_cycles(
     state: NDArray[np.void],
     moment: NDArray[np.int64],
     neighbours: Neighbours,
@@ -375,17 +435,9 @@ def run(
     robot: RobotArrays,
     motion: MotionArrays,
     tables: OutputArrays,
+    copies: NDArray[np.int64],
 ) -> int:
-    """Run cycles until Python is needed; return the stage that the newest cycle has reached, as a number of Reached.
-
-    Parameters
-    ----------
-    moment : (2,)
-        Memory for a struct timespec.
-    tables
-        Tables of outputs; empty if the robot has no outputs.
-
-    """
+    """Run cycles until Python is needed; return the stage that the newest cycle has reached."""
     s = state[0]
     while s.cycle < s.until and s.batched < len(neighbours.batch):
         reached = _begin(state, moment, neighbours, frames)
@@ -408,5 +460,45 @@ def run(
         if not accepted:
             return Reached.WRITTEN
         if (s.called or s.decides) and not s.beside:
-            return Reached.DONE
+            number = _cycles_beside(state, moment)
+            if number == 0:
+                return Reached.DONE
+            _request_decision(state, moment, number, copies)
+            if s.injected_ns >= 0:
+                return Reached.DONE
     return Reached.DONE
+
+
+@compiled(i8(_STATE, i8[::1], i8[:, ::1], _NEIGHBOURS, _FRAME_TABLES, _ROBOT, _MOTION, _OUTPUTS), releases=True)
+def run(
+    state: NDArray[np.void],
+    moment: NDArray[np.int64],
+    copies: NDArray[np.int64],
+    neighbours: Neighbours,
+    frames: FrameTables,
+    robot: RobotArrays,
+    motion: MotionArrays,
+    tables: OutputArrays,
+) -> int:
+    """Run cycles until Python is needed; return the stage that the newest cycle has reached, as a number of Reached.
+
+    The cycles use copies of the control's arrays. These are copied back when a decision beside the next cycles is
+    requested, or at the end of the call.
+
+    Parameters
+    ----------
+    moment : (2,)
+        Memory for a struct timespec.
+    copies
+        The same as in `copy_state`.
+    tables
+        Tables of outputs; empty if the robot has no outputs.
+
+    """
+    s = state[0]
+    if not s.beside:
+        copy_state(copies, False)
+    reached = _run_cycles(state, moment, neighbours, frames, robot, motion, tables, copies)
+    if not s.beside:
+        copy_state(copies, True)
+    return reached

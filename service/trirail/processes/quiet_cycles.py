@@ -1,9 +1,9 @@
 """Python code that prepares and calls the compiled function, which runs the cycles without events.
 
-Compiled code has arrays of its own for the state of the robot. They are copies of the control's arrays before each
-call, and are copied back after it. Python can therefore decide beside the cycles, in a thread of its own: the control
-first advances its commanded motion by the cycles that compiled code is about to run (Control.foresee), so that its
-decisions take effect after them. Both compute the same setpoints, since they call the same functions.
+Compiled code has arrays of its own for the state of the robot, which are copies of the control's arrays. Python can
+therefore decide beside the cycles, in a thread of its own: the control first advances its commanded motion by the
+cycles that compiled code is about to run (Control.foresee), so that its decisions take effect after them. Both compute
+the same setpoints, since they call the same functions.
 """
 
 from __future__ import annotations
@@ -60,6 +60,9 @@ class QuietResult(NamedTuple):
     """Result of trirail.control.cycle.observe, if the cycle stopped after that function."""
     code: int
     """Result of trirail.control.cycle.command, if the cycle stopped after that function."""
+    ahead: int | None
+    """Cycle after which the decision takes effect that Python has made beside the newest cycles; None if there is none.
+    """
 
     @property
     def tick(self) -> Tick:
@@ -67,31 +70,41 @@ class QuietResult(NamedTuple):
         return Tick(self.deadline_ns, self.lateness_ns, self.missed)
 
 
+class DecisionRequest(NamedTuple):
+    """Request of compiled code for a decision beside the next cycles, which takes effect after them."""
+
+    cycle: int
+    """Number of the last complete cycle."""
+    number: int
+    """Number of cycles that run beside the decision."""
+    deadline_ns: int
+    """Deadline of cycle `cycle` [ns]."""
+    requested_ns: int
+    """Time of the request [ns]."""
+    called: bool
+    """True if a neighbour has called."""
+    time: float
+    """Time of the run's law in cycle `cycle` [s]."""
+
+
 class _Copies:
-    """Copies of arrays for compiled code. Only bytes are copied, whatever the type of an array."""
+    """Copies of the control's arrays for compiled code."""
 
     def __init__(self) -> None:
-        self._pairs: list[tuple[NDArray[np.uint8], NDArray[np.uint8]]] = []
+        self._kept: list[NDArray[Any]] = []
+        self._rows: list[tuple[int, int, int]] = []
 
     def add(self, array: NDArray[Any]) -> NDArray[Any]:
         """Add an array, and return its copy."""
         copy = array.copy()
-        self._pairs.append((_bytes_of(array), _bytes_of(copy)))
+        self._kept += array, copy
+        self._rows.append((array.ctypes.data, copy.ctypes.data, array.nbytes))
         return copy
 
-    def copy_in(self) -> None:
-        """Copy the arrays to their copies."""
-        for array, copy in self._pairs:
-            copy[:] = array
-
-    def copy_back(self) -> None:
-        """Copy the copies to their arrays."""
-        for array, copy in self._pairs:
-            array[:] = copy
-
-
-def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
-    return array.reshape(-1).view(np.uint8)
+    @property
+    def table(self) -> NDArray[np.int64]:
+        """Table of the copies for compiled code, as in trirail.processes.quiet.copy_state."""
+        return np.array(self._rows, np.int64)
 
 
 class QuietCycles:
@@ -108,7 +121,9 @@ class QuietCycles:
         watch: Watch,
         urgent_flag: UrgentFlag,
         busy_wait_ns: int,
+        decide: Callable[[DecisionRequest], None],
     ) -> None:
+        """Prepare the arrays. `decide` is the function that decides beside the cycles."""
         self.cycles = 0
         """Number of cycles that the compiled function has run."""
         self._control = control
@@ -131,14 +146,16 @@ class QuietCycles:
         self._motion: tuple[Any, ...] = ()
         """Arguments of the compiled function, valid until the drives lend other tables or the motion changes."""
         self._nothing = np.zeros(1)
-        self._companion = Companion()
-        self.due = _NO_CYCLE
-        """Cycle after which the control must decide, and not later."""
-        self.lead = 0
-        """Number of cycles before `due` at which the compiled call returns, so that the decision can be made ahead."""
+        self._decide = decide
+        self._companion = Companion(self._answer)
+        self.beside = 0, quiet.MOST_AHEAD
+        """Minimum and maximum number of cycles that run beside a decision, which tests change."""
         measured, setpoints = control.measured, control.setpoints
         self._measured, self._commanded, self._furthest = _Copies(), _Copies(), _Copies()
         self._robot = self._robot_arrays()
+        self._measured_table = self._measured.table
+        self._robot_table = np.concatenate((self._measured_table, self._commanded.table))
+        self._table = self._robot_table
         state = self._state
         self.parts_ns = state.parts_ns
         """Durations of the parts of the newest cycle [ns], in the memory to which compiled code writes."""
@@ -146,12 +163,14 @@ class QuietCycles:
         state.fastest, state.limit, state.step = measured.fastest, measured.limit, setpoints.step
         state.gateway_place, state.gateway_patience = PROCESSES.index("gateway"), watch.patience
         state.report_after, state.busy_wait_ns = control.outputs.report_after, busy_wait_ns
+        state.requested = -1
 
     def run(
         self,
         ticker: Ticker,
         overruns: Overruns,
         spare_ns: int,
+        budget_ns: int,
         work: Callable[[], None] | None = None,
         *,
         listens: bool,
@@ -159,13 +178,15 @@ class QuietCycles:
     ) -> QuietResult | None:
         """Run cycles until an event or the end of a batch, and return the result for the newest cycle.
 
-        Return None if no cycle was run, because Python must run the next cycle. Otherwise call `conclude`, or decide
-        ahead.
+        Return None if no cycle was run, because Python must run the next cycle. Otherwise call `conclude` or, if Python
+        has decided beside the newest cycles, `copy_measured_back`, or `copy_back` if the control is taken back.
 
         Parameters
         ----------
         spare_ns
             Time before a tick in which calls are not served [ns].
+        budget_ns
+            Time that a decision beside the cycles needs [ns].
         work
             Work beside the cycles that changes neither the control nor the drives.
         listens
@@ -182,12 +203,15 @@ class QuietCycles:
             return None
         state.injected_ns = ticker.sleep_if_injected()
         state.until = control.cycles + (1 if once or state.injected_ns >= 0 else max(1, self._reports.due_after))
-        state.beside, state.listens, state.spare_ns = False, listens, spare_ns
+        state.beside, state.listens, state.spare_ns, state.requested = False, listens, spare_ns, -1
         state.logged, state.report_due = control.outputs.logged, control.outputs.report_due
+        state.budget_ns = budget_ns
+        state.least, state.most = self.beside if self._runs_beside else (0, 0)
+        state.lead = min(max(state.least, -(-budget_ns // state.period_ns) - 1), state.most)
         self._poll_set.refresh()
-        self._copy_in()
         reached = self._call_beside(work, ticker, overruns)
-        self.copy_back()
+        if state.requested >= 0:
+            return self.result(reached)
         control.outputs.update_log(state.logged, state.report_due)
         self.leave_at(reached)
         control.resume(state.cycle, state.time, None)
@@ -195,33 +219,38 @@ class QuietCycles:
             self.send_on()
         return self.result(reached)
 
-    def run_beside(self, ticker: Ticker, overruns: Overruns, number: int, work: Callable[[], None]) -> QuietResult:
-        """Run `number` cycles while `work` runs in another thread, in which the control foresees and decides.
-
-        Return the result for the newest cycle. The cycles end early at a stage that needs Python. Call this only after
-        `run`, if `runs_beside` is True, and then `copy_measured_back`, or `copy_back` if the control is taken back.
-        """
+    def run_beside(self, ticker: Ticker, overruns: Overruns) -> Reached:
+        """Run cycles with an injected clock, beside a requested decision; return the stage of the newest."""
         state = self._state
-        last = state.cycle + number
-        state.beside, state.listens, state.until = True, False, last
-        if state.injected_ns < 0:
-            return self.result(self._call_beside(work, ticker, overruns))
-        work()  # before the cycles or beside them: the result is the same
-        reached = Reached.DONE
+        reached, last = Reached.DONE, state.until
+        self._answer()  # before the cycles or beside them: the result is the same
         while reached is Reached.DONE and state.cycle < last:
             state.injected_ns, state.until = ticker.sleep_if_injected(), state.cycle + 1
             reached = self._call(ticker, overruns)
-        return self.result(reached)
+        state.until = last
+        return reached
+
+    def _answer(self) -> None:
+        """Decide beside the cycles."""
+        state = self._state
+        request = state.requested, state.until - state.requested, state.requested_deadline_ns, state.requested_ns
+        self._decide(DecisionRequest(*request, state.requested_called, state.requested_time))
 
     def _call_beside(self, work: Callable[[], None] | None, ticker: Ticker, overruns: Overruns) -> Reached:
-        """Call the compiled function beside `work`."""
-        if work is None:
-            return self._call(ticker, overruns)
-        if self._state.injected_ns >= 0 or self._calls_python:
-            work()
-            return self._call(ticker, overruns)
+        """Call the compiled function beside `work`, and beside a decision that it requests, if any."""
+        state = self._state
+        if state.injected_ns >= 0 or self._calls_python:
+            if work is not None:
+                work()
+            reached = self._call(ticker, overruns)
+            return self.run_beside(ticker, overruns) if state.requested >= 0 else reached
+        self._companion.start()
+        state.doorbell = self._companion.doorbell
         with self._companion.working(work):
-            return self._call(ticker, overruns)
+            reached = self._call(ticker, overruns)
+        if state.requested >= 0:
+            self._companion.wait()
+        return reached
 
     def _call(self, ticker: Ticker, overruns: Overruns) -> Reached:
         """Call the compiled function, and return the stage that it has reached."""
@@ -231,7 +260,7 @@ class QuietCycles:
         state.gateway_seen, state.gateway_turns = watch.seen, watch.silent_turns
         state.urgent_seen = self._urgent_flag.seen
         first, moment, *rest = self._tables
-        reached = Reached(quiet.run(first, moment, self._neighbours(), *rest, *self._motion))
+        reached = Reached(quiet.run(first, moment, self._table, self._neighbours(), *rest, *self._motion))
         overruns.all, overruns.in_a_row = state.overruns, state.in_a_row
         watch.seen, watch.silent_turns = state.gateway_seen, state.gateway_turns
         self._reports.batched, ticker.deadline_ns = state.batched, state.deadline_ns
@@ -242,10 +271,11 @@ class QuietCycles:
         """Return the result for the newest cycle, which has reached a stage."""
         state = self._state
         decides = state.decides and reached in (Reached.WRITTEN, Reached.DONE)
+        ahead = state.until if state.requested >= 0 else None
         self._drives.next_sync = (state.deadline_ns + state.period_ns) * 1e-9  # for commands at the end of a motion
         tick = state.deadline_ns, state.lateness_ns, state.missed
         return QuietResult(
-            reached, state.cycle, *tick, state.marked_ns, state.called, decides, state.behind, state.code
+            reached, state.cycle, *tick, state.marked_ns, state.called, decides, state.behind, state.code, ahead
         )
 
     def leave_at(self, reached: Reached) -> None:
@@ -293,7 +323,7 @@ class QuietCycles:
         return number
 
     @property
-    def runs_beside(self) -> bool:
+    def _runs_beside(self) -> bool:
         """True if Python may decide beside the next cycles.
 
         They then execute a motion or hold the robot, there is no other motion to follow, and there are no outputs.
@@ -308,18 +338,13 @@ class QuietCycles:
         """True if Python exchanges the frames for compiled code, unless the clock is injected."""
         return self._state.injected_ns < 0 and (self._lent is None or bool(self._lent.bus[0] < 0))
 
-    def _copy_in(self) -> None:
-        for copies in (self._measured, self._commanded, self._furthest):
-            copies.copy_in()
-
     def copy_measured_back(self) -> None:
         """Copy the measured state of the robot back from compiled code."""
-        self._measured.copy_back()
+        quiet.copy_state(self._measured_table, True)
 
     def copy_back(self) -> None:
         """Copy the whole state of the robot back from compiled code."""
-        for copies in (self._measured, self._commanded, self._furthest):
-            copies.copy_back()
+        quiet.copy_state(self._table, True)
 
     def _neighbours(self) -> quiet.Neighbours:
         return quiet.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
@@ -361,8 +386,7 @@ class QuietCycles:
         state.source = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
         state.cycle, state.mode = self._control.cycles, MODES.index(self._control.state.mode)
         state.held, state.at_rest, state.code = steady.held, steady.at_rest, steady.code
-        self.due = int(min(max(steady.until, state.cycle), _NO_CYCLE))
-        state.due = max(state.cycle, self.due - (self.lead if self.runs_beside else 0))
+        state.due = int(min(max(steady.until, state.cycle), _NO_CYCLE))
         state.settles, state.timeout = steady.settles_by is not None, steady.settles_by or 0
         runs = self._control.schedule.runs
         state.time = runs[0].time if runs else 0.0
@@ -415,6 +439,7 @@ class QuietCycles:
         path, law = (run.path, run.law) if run is not None else (_EMPTY_PATH, _IDLE_LAW)
         self._furthest = _Copies()
         furthest = self._furthest.add(run.furthest if run is not None else self._nothing)
+        self._table = np.concatenate((self._robot_table, self._furthest.table))
         outputs = self._control.outputs
         outputs.prepare(run, self._control.schedule.version)
         motion = quiet.MotionArrays(path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest)

@@ -53,6 +53,8 @@ class QuietState(ctypes.Structure):
     """Last cycle that may be run."""
     due: int
     """Cycle after which a decision is due."""
+    lead: int
+    """Number of cycles before `due` at which a decision beside these cycles is requested."""
     spare_ns: int
     """Time before a tick in which calls are not served [ns]."""
     called: bool
@@ -94,8 +96,25 @@ class QuietState(ctypes.Structure):
     """Cycle at which that wait times out."""
 
     # The neighbours
+    least: int
+    most: int
+    """Minimum and maximum number of cycles that run beside a decision."""
+    budget_ns: int
+    """Time that a decision beside the cycles needs, from the request until its result can be used."""
+    doorbell: int
+    """Descriptor of the eventfd that wakes up the thread which decides beside the cycles."""
     beside: bool
     """Whether Python decides beside the cycles, so that calls, other decisions and a lost gateway wait."""
+    requested: int
+    """Cycle after which a decision beside the next cycles, up to `until`, was requested; -1 if none was requested."""
+    requested_ns: int
+    """Time of the request."""
+    requested_deadline_ns: int
+    """Value of `deadline_ns` at the request."""
+    requested_called: bool
+    """Value of `called` at the request."""
+    requested_time: float
+    """Value of `time` at the request."""
     listens: bool
     """Whether a call during the wait for the next tick is served immediately."""
     urgent_seen: Unsigned

@@ -15,6 +15,7 @@ from trirail_drivers.interface import DriveGroup, UnreadyDrives
 from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes.clock import Tick
+from trirail.processes.quiet import MOST_AHEAD
 from trirail.wire.decoding import INVALID
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.links import Port
@@ -87,11 +88,11 @@ class Reports:
         self._unsent_inputs: list[ControlInput] = []
         self._postponed = 0, 0
         """Number of waiting events that belong to an earlier cycle than later events, and the number of that cycle."""
-        self.batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
-        """Maximum number of records in a batch."""
+        self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
+        """Number of records in a full batch. Cycles beside a decision may add MOST_AHEAD records."""
         self._made = control.measured.record.view(np.uint8).data
         """Bytes of the newest cycle's record, which the control fills."""
-        self._batch, self._spare = (memoryview(bytearray(1 + self.batch_size * SIZE)) for _ in range(2))
+        self._batch, self._spare = (memoryview(bytearray(1 + (self._batch_size + MOST_AHEAD) * SIZE)) for _ in range(2))
         self._batch[0] = self._spare[0] = Kind.RECORDS
         self._unsent_batch: memoryview | None = None
         """Filled part of a batch that was set aside; it is sent before the records of the present batch."""
@@ -131,12 +132,12 @@ class Reports:
     @property
     def due_after(self) -> int:
         """Number of cycles after which the batch is due to be sent; 0 if it is due now."""
-        return max(0, self.batch_size - self.batch_size // SPARE_SHARE - self.batched)
+        return max(0, self._batch_size - self._batch_size // SPARE_SHARE - self.batched)
 
     @property
     def full(self) -> bool:
         """True if the batch has no space for another record, and must be sent."""
-        return self.batched == self.batch_size
+        return self.batched >= self._batch_size
 
     @property
     def idle(self) -> bool:
