@@ -20,7 +20,16 @@ from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
-from trirail.wire.packets import CommandRequest, ControlInput, DecidedAhead, EventReport, Kind, decode_answer
+from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
+from trirail.wire.packets import (
+    CommandRequest,
+    ControlInput,
+    DecidedAhead,
+    EventReport,
+    GoalRequest,
+    Kind,
+    decode_answer,
+)
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME
@@ -184,3 +193,30 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
             assert len(modes) < 3 or modes[2] is not Mode.MOVING
     if mishap not in ("a late tick", "late frames", "silence"):
         assert {*happened} - {Reached.DONE}, "some of it needed Python"
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_path_ends_in_the_same_cycle_as_without_cycles_beside_decisions(number: int, tmp_path: Path) -> None:
+    config, lengths = CONFIGS["cia402"], []
+    enable = CommandRequest(1, "ann", Command.ENABLE)
+    happens = {30: [Happening(lambda session: session.ask(enable))]}
+    for at, duration in ((200, 0.2), (500, 0.2345), (800, 0.25), (1100, 0.3)):
+        x = 1e-5 * (at - 200), 1e-5 * (at + 100)
+        points = TrajectoryPoint(0.0, x[0], 0.0, 0.0), TrajectoryPoint(duration, x[1], 0.0, 0.0)
+        goal = GoalRequest(at, "ann", f"g{at}", TrajectoryGoal(points, settle=False), 0)
+        happens[at] = [Happening(lambda session, goal=goal: session.ask(goal))]  # type: ignore[misc]
+    for least in (0, number):
+        folder = tmp_path / str(least)
+        folder.mkdir()
+        session = Session(config, folder, "unix", quiet=True)
+        quiet_of(session).beside = least, least
+        try:
+            records, inputs, _ = recorded(session, happens, CYCLES)
+        finally:
+            session.close()
+        moving = (records["mode"] == MODES.index(Mode.MOVING)).astype(int)
+        changes = np.flatnonzero(np.diff(moving))
+        lengths.append(np.diff(changes)[::2].tolist())
+        assert (least > 0) == any(isinstance(each.given, DecidedAhead) for each in inputs)
+    assert len(lengths[0]) == 4
+    assert lengths[0] == lengths[1]

@@ -63,6 +63,7 @@ __all__ = [
     "NOT_BRAKING",
     "PASSED",
     "command",
+    "ends_at",
     "follow",
     "hold",
     "observe",
@@ -238,6 +239,20 @@ def _solve(
     return 0
 
 
+@compiled()
+def _ends_at(law: tuple[float, float, float], target: float, end: float, duration: float) -> int:
+    """Return the sum of PASSED and AT_REST for a state of the law."""
+    s, rate, change = law
+    at_rest = s >= duration or (target == 0.0 and rate == 0.0 and change == 0.0)
+    return PASSED * (s >= end) + AT_REST * at_rest
+
+
+@compiled()
+def ends_at(knots: Array, law_knots: Array, law_pieces: Array, time: float, target: float, end: float) -> int:
+    """Return the sum of PASSED and AT_REST that `command` would return for a later time of the law [s]."""
+    return _ends_at(law_at(law_knots, law_pieces, time), target, end, knots[-1])
+
+
 @compiled(
     i8(
         *(LEGS, BOUND, KNOTS, PIECES, b1, f8[:, ::1], KNOTS, PIECES),
@@ -289,7 +304,7 @@ def command(
 
     """
     law = law_at(law_knots, law_pieces, time)
-    s, rate, change = law
+    s, rate, _ = law
     motion[1] = motion[0]
     if platform_at(legs, knots, pieces, in_sliders, tools, law, motion[1, 0], motion[0]) != 0:
         motion[0] = math.nan
@@ -307,9 +322,7 @@ def command(
     progress = max(0.0, min(1.0, (s - begun) / (end - begun))) if end > begun else 1.0
     remaining = max(0.0, arrival - time if target != 0.0 else end - s)
     _record_command(motion, sliders, progress, remaining, record)
-    passed = s >= end
-    at_rest = s >= knots[-1] or (target == 0.0 and rate == 0.0 and change == 0.0)
-    return PASSED * passed + AT_REST * at_rest + 4 * refused
+    return _ends_at(law, target, end, knots[-1]) + 4 * refused
 
 
 @compiled(i8(LEGS, BOUND, MOTION, SLIDERS, BACKLASH_STATES, f8[::1], RECORD))

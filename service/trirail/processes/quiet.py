@@ -77,6 +77,8 @@ class Reached(IntEnum):
     """The cycle is complete, and a neighbour has called during the wait for the next tick."""
 
 
+NEVER: Final = 1 << 62
+"""Number of a cycle that is never reached."""
 CONTINUE: Final = -1
 """Result of a stage of a cycle if the cycle continues with the next stage."""
 FOLLOW, HOLD, COMMAND = 0, 1, 2
@@ -333,7 +335,14 @@ def solve(
         )
     monitored = robot.monitored[0]
     in_position = s.settles and (monitored.inside >= monitored.dwell or s.cycle + 1 >= s.timeout)
-    s.decides, s.code = in_position or code != s.code or s.cycle + 1 >= s.due - s.lead, code
+    s.ends, time = NEVER, s.time
+    for ahead in range(1, s.lead + 1 if s.source == COMMAND else 1):
+        time += s.period
+        path_end = cycle.ends_at(motion.knots, motion.law_knots, motion.law_pieces, time, s.target, s.course[1])
+        if path_end != code and s.ends == NEVER:
+            s.ends = s.cycle + 1 + ahead
+    is_due = s.cycle + 1 >= s.due - s.lead or s.ends != NEVER
+    s.decides, s.code = in_position or code != s.code or is_due, code
     late = _now_ns(state, moment) / 1e9 - s.synced > s.period
     if code >> 2 != 0 or late or not set_frames(frames.setpoints, frames.axes, robot.sliders[0]):
         return Reached.SOLVED
@@ -394,13 +403,13 @@ def copy_state(copies: NDArray[np.int64], back: bool) -> None:
 def _cycles_beside(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
     """Return the number of cycles that must run beside a decision, so that none is late; 0 to decide before the next.
 
-    A decision that is due in a certain cycle is made for exactly that cycle.
+    A decision that is due in a certain cycle, or at the end of a motion, is made for exactly that cycle.
     """
     s = state[0]
     if s.most == 0:
         return 0
     missing_ns = s.budget_ns - (s.deadline_ns + s.period_ns - _now_ns(state, moment))
-    number, until_due = min(max(s.least, -(-missing_ns // s.period_ns)), s.most), s.due - s.cycle
+    number, until_due = min(max(s.least, -(-missing_ns // s.period_ns)), s.most), min(s.due, s.ends) - s.cycle
     if until_due < 0:
         return int(number)
     return int(until_due if s.decides and until_due <= s.most else min(number, until_due))

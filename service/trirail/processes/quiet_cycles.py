@@ -33,8 +33,6 @@ from trirail.wire.links import Port
 from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import MODES
 
-_NO_CYCLE = 1 << 62
-"""Number of a cycle that is never reached."""
 _IDLE_LAW = constant_law(1.0)
 _EMPTY_PATH = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
 """Law and path that are passed to compiled code if there is no motion."""
@@ -386,7 +384,7 @@ class QuietCycles:
         state.source = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
         state.cycle, state.mode = self._control.cycles, MODES.index(self._control.state.mode)
         state.held, state.at_rest, state.code = steady.held, steady.at_rest, steady.code
-        state.due = int(min(max(steady.until, state.cycle), _NO_CYCLE))
+        state.due = int(min(max(steady.until, state.cycle), quiet.NEVER))
         state.settles, state.timeout = steady.settles_by is not None, steady.settles_by or 0
         runs = self._control.schedule.runs
         state.time = runs[0].time if runs else 0.0

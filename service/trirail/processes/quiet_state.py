@@ -55,6 +55,8 @@ class QuietState(ctypes.Structure):
     """Cycle after which a decision is due."""
     lead: int
     """Number of cycles before `due` at which a decision beside these cycles is requested."""
+    ends: int
+    """Cycle in which the motion reaches the end of its goal, if that is at most `lead` cycles away."""
     spare_ns: int
     """Time before a tick in which calls are not served [ns]."""
     called: bool
