@@ -77,7 +77,7 @@ class Reached(IntEnum):
     """The cycle is complete, and a neighbour has called during the wait for the next tick."""
 
 
-NEVER: Final = 1 << 62
+NO_CYCLE: Final = 1 << 62
 """Number of a cycle that is never reached."""
 CONTINUE: Final = -1
 """Result of a stage of a cycle if the cycle continues with the next stage."""
@@ -335,13 +335,13 @@ def solve(
         )
     monitored = robot.monitored[0]
     in_position = s.settles and (monitored.inside >= monitored.dwell or s.cycle + 1 >= s.timeout)
-    s.ends, time = NEVER, s.time
+    s.ends, time = NO_CYCLE, s.time
     for ahead in range(1, s.lead + 1 if s.source == COMMAND else 1):
         time += s.period
         path_end = cycle.ends_at(motion.knots, motion.law_knots, motion.law_pieces, time, s.target, s.course[1])
-        if path_end != code and s.ends == NEVER:
+        if path_end != code and s.ends == NO_CYCLE:
             s.ends = s.cycle + 1 + ahead
-    is_due = s.cycle + 1 >= s.due - s.lead or s.ends != NEVER
+    is_due = s.cycle + 1 >= s.due - s.lead or s.ends != NO_CYCLE
     s.decides, s.code = in_position or code != s.code or is_due, code
     late = _now_ns(state, moment) / 1e9 - s.synced > s.period
     if code >> 2 != 0 or late or not set_frames(frames.setpoints, frames.axes, robot.sliders[0]):

@@ -384,7 +384,7 @@ class QuietCycles:
         state.source = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
         state.cycle, state.mode = self._control.cycles, MODES.index(self._control.state.mode)
         state.held, state.at_rest, state.code = steady.held, steady.at_rest, steady.code
-        state.due = int(min(max(steady.until, state.cycle), quiet.NEVER))
+        state.due = int(min(max(steady.until, state.cycle), quiet.NO_CYCLE))
         state.settles, state.timeout = steady.settles_by is not None, steady.settles_by or 0
         runs = self._control.schedule.runs
         state.time = runs[0].time if runs else 0.0
