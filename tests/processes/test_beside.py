@@ -195,28 +195,49 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
         assert {*happened} - {Reached.DONE}, "some of it needed Python"
 
 
-@pytest.mark.parametrize("number", [1, 2])
-def test_a_path_ends_in_the_same_cycle_as_without_cycles_beside_decisions(number: int, tmp_path: Path) -> None:
-    config, lengths = CONFIGS["cia402"], []
-    enable = CommandRequest(1, "ann", Command.ENABLE)
-    happens = {30: [Happening(lambda session: session.ask(enable))]}
-    for at, duration in ((200, 0.2), (500, 0.2345), (800, 0.25), (1100, 0.3)):
+PATHS = ((200, 0.2), (500, 0.2345), (800, 0.25), (1100, 0.3))
+"""Cycles in which paths are requested, and their durations [s]."""
+
+
+def path_lengths(session: Session, disturbed_at: list[int]) -> tuple[list[int], bool]:
+    """Run a session with paths and requests that are refused; return the cycles of each path.
+
+    Also return whether there were decisions beside the cycles.
+    """
+    happens = {30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))]}
+    for at, duration in PATHS:
         x = 1e-5 * (at - 200), 1e-5 * (at + 100)
         points = TrajectoryPoint(0.0, x[0], 0.0, 0.0), TrajectoryPoint(duration, x[1], 0.0, 0.0)
         goal = GoalRequest(at, "ann", f"g{at}", TrajectoryGoal(points, settle=False), 0)
         happens[at] = [Happening(lambda session, goal=goal: session.ask(goal))]  # type: ignore[misc]
-    for least in (0, number):
-        folder = tmp_path / str(least)
+    for at in disturbed_at:
+        request = CommandRequest(5000 + at, "ann", Command.ENABLE)
+        happens[at] = [Happening(lambda session, request=request: session.ask(request))]  # type: ignore[misc]
+    try:
+        records, inputs, _ = recorded(session, happens, CYCLES)
+    finally:
+        session.close()
+    changes = np.flatnonzero(np.diff((records["mode"] == MODES.index(Mode.MOVING)).astype(int)))
+    return np.diff(changes)[::2].tolist(), any(isinstance(each.given, DecidedAhead) for each in inputs)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_path_ends_in_the_same_cycle_as_without_cycles_beside_decisions(seed: int, tmp_path: Path) -> None:
+    """It does so even if other requests arrive in its last cycles, and if decisions take more time than expected."""
+    chance = random.Random(seed)
+    ends = [at + round(1e3 * duration) for at, duration in PATHS]
+    disturbed_at = [end - back for end in ends for back in chance.sample(range(-4, 8), 4)] if seed > 0 else []
+    lengths = []
+    for beside in (0, 0), (1, 1), (2, 2), (0, 2):
+        folder = tmp_path / "-".join(map(str, beside))
         folder.mkdir()
-        session = Session(config, folder, "unix", quiet=True)
-        quiet_of(session).beside = least, least
-        try:
-            records, inputs, _ = recorded(session, happens, CYCLES)
-        finally:
-            session.close()
-        moving = (records["mode"] == MODES.index(Mode.MOVING)).astype(int)
-        changes = np.flatnonzero(np.diff(moving))
-        lengths.append(np.diff(changes)[::2].tolist())
-        assert (least > 0) == any(isinstance(each.given, DecidedAhead) for each in inputs)
-    assert len(lengths[0]) == 4
-    assert lengths[0] == lengths[1]
+        session = Session(CONFIGS["cia402"], folder, "unix", quiet=True)
+        quiet_of(session).beside = beside
+        if beside == (0, 2):
+            budget = session.loop._beside_budget
+            budget.note = lambda _, budget=budget: setattr(budget, "ns", chance.randrange(2_000_000))  # type: ignore[method-assign, misc]
+        each, ahead = path_lengths(session, disturbed_at)
+        lengths.append(each)
+        assert ahead == (beside != (0, 0))
+    assert len(lengths[0]) == len(PATHS)
+    assert lengths == lengths[:1] * 4

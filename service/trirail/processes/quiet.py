@@ -335,14 +335,13 @@ def solve(
         )
     monitored = robot.monitored[0]
     in_position = s.settles and (monitored.inside >= monitored.dwell or s.cycle + 1 >= s.timeout)
-    s.ends, time = NO_CYCLE, s.time
-    for ahead in range(1, s.lead + 1 if s.source == COMMAND else 1):
+    s.ends, time = s.cycle + 1 if code != s.code else NO_CYCLE, s.time
+    for ahead in range(1, s.most + 1 if s.source == COMMAND else 1):
         time += s.period
         path_end = cycle.ends_at(motion.knots, motion.law_knots, motion.law_pieces, time, s.target, s.course[1])
         if path_end != code and s.ends == NO_CYCLE:
             s.ends = s.cycle + 1 + ahead
-    is_due = s.cycle + 1 >= s.due - s.lead or s.ends != NO_CYCLE
-    s.decides, s.code = in_position or code != s.code or is_due, code
+    s.decides, s.code = in_position or s.cycle + 1 >= min(s.due, s.ends) - s.lead, code
     late = _now_ns(state, moment) / 1e9 - s.synced > s.period
     if code >> 2 != 0 or late or not set_frames(frames.setpoints, frames.axes, robot.sliders[0]):
         return Reached.SOLVED
@@ -409,10 +408,8 @@ def _cycles_beside(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
     if s.most == 0:
         return 0
     missing_ns = s.budget_ns - (s.deadline_ns + s.period_ns - _now_ns(state, moment))
-    number, until_due = min(max(s.least, -(-missing_ns // s.period_ns)), s.most), min(s.due, s.ends) - s.cycle
-    if until_due < 0:
-        return int(number)
-    return int(until_due if s.decides and until_due <= s.most else min(number, until_due))
+    until_due = min(s.due if s.due >= s.cycle else NO_CYCLE, s.ends) - s.cycle
+    return int(until_due if until_due <= s.most else min(max(s.least, -(-missing_ns // s.period_ns)), s.most))
 
 
 @compiled()

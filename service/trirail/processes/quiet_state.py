@@ -54,9 +54,9 @@ class QuietState(ctypes.Structure):
     due: int
     """Cycle after which a decision is due."""
     lead: int
-    """Number of cycles before `due` at which a decision beside these cycles is requested."""
+    """Number of cycles before `due` or `ends` at which a decision beside these cycles is requested."""
     ends: int
-    """Cycle in which the motion reaches the end of its goal, if that is at most `lead` cycles away."""
+    """Cycle in which the motion reaches the end of its goal, if that is at most `most` cycles away."""
     spare_ns: int
     """Time before a tick in which calls are not served [ns]."""
     called: bool
