@@ -67,7 +67,7 @@ def frozen_and_replaced(service: Service) -> None:
         assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         robot.disable()
     assert service.end() == 0
-    assert_stopped_smoothly(service.frames())
+    assert_stopped_smoothly(service)
     recorded = recording(service)
     assert ("long", "stopped") in outcomes(recorded)
     assert any("the gateway is frozen, without a sign of life for 0.3 s" in event.message for event in events(recorded))
@@ -129,7 +129,7 @@ def test_sigterm_to_the_loop_alone_is_told_as_what_it_is(service: Service) -> No
         "the service ends"
     )
     assert said in service.log.read_text()
-    assert_stopped_smoothly(service.frames())
+    assert_stopped_smoothly(service)
     recorded = recording(service)
     assert outcomes(recorded) == [("long", "stopped")]
     assert MODES[recorded.records["mode"][-1]] is Mode.DISABLED
@@ -157,7 +157,7 @@ def test_a_killed_parent_leaves_nobody_and_a_complete_recording(name: str, servi
     if name == "fork-server":
         assert service.process.wait(END_WITHIN) == 1
         assert "the process that starts the others has died (killed by SIGKILL)" in service.log.read_text()
-    assert_stopped_smoothly(service.frames())
+    assert_stopped_smoothly(service)
     recorded = recording(service)
     assert outcomes(recorded) == [("long", "stopped")]
     assert MODES[recorded.records["mode"][-1]] is Mode.DISABLED

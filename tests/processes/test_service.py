@@ -15,10 +15,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Self
 from urllib.parse import urlsplit
 
 import edsfiles
@@ -26,7 +26,8 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
-from can import CanutilsLogReader
+from can import CanutilsLogReader, Message
+from numpy.typing import NDArray
 from refusals import refused_as
 from trirail.cli.remote_view import RemoteView
 from trirail.client.client import Robot
@@ -166,6 +167,8 @@ def told(robot: Robot, enough: Callable[[list[Event]], bool]) -> list[Event]:
     raise AssertionError(heard)
 
 
+LOST_AFTER_S = 0.01
+"""Time between setpoints in a recording from which cycles of a period of 1 ms may be missing [s]."""
 SLOWLY = 0.02
 """Of full speed: whatever is done next is done in motion, on a busy machine as well."""
 
@@ -177,7 +180,7 @@ def in_motion(robot: Robot, speed: float = SLOWLY) -> None:
     until(robot, lambda state: state.goal is not None and state.goal.progress > 0.02)
 
 
-def positions(sent: list[tuple[int, bytes]], node: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+def positions(sent: list[tuple[int, bytes]], node: int) -> NDArray[np.float64]:
     """Setpoints that a drive was sent [m]."""
     counts = [
         canopen_frames.SETPOINT.unpack(data)[0]
@@ -187,12 +190,31 @@ def positions(sent: list[tuple[int, bytes]], node: int) -> np.ndarray[Any, np.dt
     return np.array(counts) / 1e7
 
 
-def assert_stopped_smoothly(sent: list[tuple[int, bytes]]) -> None:
-    """The setpoints on the bus end at standstill, and their differences never jump."""
+def assert_stopped_smoothly(service: Service) -> None:
+    """The setpoints on the bus end at standstill, and their differences never jump.
+
+    If the recording lacks cycles because the recorder was too slow, differences across these are not compared.
+    """
+    incomplete = "(recorder too slow)" in service.log.read_text()
+    (log,) = (service.folder / "recordings").glob("*.log")
     for node in (1, 2, 3):
-        acceleration = np.diff(positions(sent, node), 2) / 1e-3**2
-        assert np.abs(acceleration).max() < 15.0 + 0.4  # the limit, and the rounding of three counts
-        assert np.ptp(positions(sent, node)[-5:]) < 2e-6  # without power the setpoint is what is measured
+        times, setpoints = setpoints_of(CanutilsLogReader(log), node)
+        gaps = np.flatnonzero((np.diff(times) > LOST_AFTER_S) & incomplete) + 1
+        for part in np.split(setpoints, gaps):
+            acceleration = np.diff(part, 2) / 1e-3**2
+            assert np.abs(acceleration).max(initial=0.0) < 15.0 + 0.4  # the limit, and the rounding of three counts
+        assert np.ptp(setpoints[-5:]) < 2e-6  # without power the setpoint is what is measured
+
+
+def setpoints_of(frames: Iterable[Message], node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return when a drive was sent setpoints [s], and the setpoints [m]."""
+    sent = [
+        (frame.timestamp, canopen_frames.SETPOINT.unpack(frame.data)[0] / 1e7)
+        for frame in frames
+        if frame.arbitration_id == canopen_frames.RPDO2 + node
+    ]
+    times, setpoints = np.array(sent, np.float64).T
+    return times, setpoints
 
 
 def controlwords(sent: list[tuple[int, bytes]], node: int) -> list[int]:
@@ -254,7 +276,7 @@ def test_a_session(cold_service: Service) -> None:
         words = controlwords(sent, node)
         assert [words.index(word) for word in (0x06, 0x07, 0x0F)] == sorted(words.index(w) for w in (0x06, 0x07, 0x0F))
         assert words[-1] & 0b1111 != 0b1111
-    assert_stopped_smoothly(sent)
+    assert_stopped_smoothly(cold_service)
 
 
 def test_a_session_with_odrives(tmp_path: Path) -> None:
@@ -535,7 +557,7 @@ def test_a_flood_of_goals_ends_one_by_one_and_a_stop_overtakes_it(service: Servi
     assert {outcome for _, outcome in outcomes[:-1]} <= {"done", "preempted", "stopped"}  # done: the next came late
     assert outcomes[-1][1] == "stopped"
     assert service.end() == 0, service.log.read_text()
-    assert_stopped_smoothly(service.frames())
+    assert_stopped_smoothly(service)
 
 
 @pytest.mark.parametrize("command", ["stop", "quick_stop", "disable", "override"])
@@ -670,7 +692,7 @@ def test_a_signal_in_motion_is_a_controlled_stop(service: Service, number: int) 
         in_motion(robot)
         assert service.end(number) == 0
     sent = service.frames()
-    assert_stopped_smoothly(sent)
+    assert_stopped_smoothly(service)
     for node in (1, 2, 3):
         assert controlwords(sent, node)[-1] & 0b10 == 0  # disable voltage
         assert positions(sent, node)[-1] != positions(sent, node)[0]
@@ -704,7 +726,7 @@ def test_a_killed_gateway_is_a_controlled_stop(service: Service) -> None:
         told(robot, lambda heard: (heard[-1].id, heard[-1].outcome) == ("long", "stopped"))
         assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
     assert service.end() == 0
-    assert_stopped_smoothly(service.frames())
+    assert_stopped_smoothly(service)
     assert "the gateway has died (killed by SIGKILL)" in service.log.read_text()
 
 
@@ -734,7 +756,7 @@ def test_a_planner_that_is_lost_costs_a_goal_and_no_more(service: Service, harm:
         assert state.pose[0] == pytest.approx(0.1, abs=1e-5)
         planned_again(robot)
     assert service.end() == 0
-    assert_stopped_smoothly(service.frames())
+    assert_stopped_smoothly(service)
     log = service.log.read_text()
     assert "the motion in progress continues, and new goals are refused; restarting it" in log
     assert "Traceback" not in log
@@ -748,7 +770,7 @@ def test_a_robot_is_stopped_without_a_planner(service: Service, harm: signal.Sig
         robot.stop()
         assert until(robot, lambda state: state.mode == "holding").pose[0] < 0.09
     assert service.end() == 0
-    assert_stopped_smoothly(service.frames())
+    assert_stopped_smoothly(service)
 
 
 def test_a_killed_recorder_does_not_matter(service: Service) -> None:
