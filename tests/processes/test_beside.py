@@ -14,7 +14,7 @@ import pytest
 from control_rig import carried
 from msgspec import structs
 from numpy.typing import NDArray
-from processes.test_quiet import CONFIGS, CYCLES, Happening, Session, requests_of_two, script
+from processes.test_quiet import CONFIGS, CYCLES, Happening, Session, requests_of_two, script, stops_first
 from trirail.analysis import replay
 from trirail.config import Config
 from trirail.control.control import Control
@@ -82,7 +82,7 @@ def replayed(config: Config, records: NDArray[np.void], inputs: list[ControlInpu
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.parametrize(
     ("protocol", "seed"),
-    [*(("cia402", seed) for seed in range(6)), *(("odrive", seed) for seed in range(2)), ("two", 1)],
+    [*(("cia402", seed) for seed in range(6)), *(("odrive", seed) for seed in range(2)), ("two", 1), ("stops", 1)],
 )
 def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last_bit(
     protocol: str, seed: int, number: int, tmp_path: Path
@@ -90,7 +90,8 @@ def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last
     config = CONFIGS.get(protocol, CONFIGS["cia402"])
     session = Session(config, tmp_path, "unix", quiet=True)
     quiet_of(session).beside = number, number
-    happens = requests_of_two(seed) if protocol == "two" else script(seed, protocol)
+    generate = {"two": requests_of_two, "stops": stops_first}.get(protocol)
+    happens = generate(seed) if generate is not None else script(seed, protocol)
     try:
         records, inputs, events = recorded(session, happens, CYCLES)
     finally:

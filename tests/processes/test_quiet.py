@@ -12,6 +12,7 @@ import re
 import struct
 import time
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
@@ -26,6 +27,8 @@ from lockstep import CARRIERS, STEP_NS, Lockstep
 from msgspec import structs
 from trirail.config import Config
 from trirail.motion.motion_planner import MotionPlanner
+from trirail.motion.runs import Run
+from trirail.motion.schedule import Schedule
 from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.loop import Loop
@@ -585,13 +588,15 @@ LOSSES = (
 )
 
 
+def cycles_by_python(session: Session) -> int:
+    """Number of cycles that Python has run."""
+    return session.loop.control.cycles - session.loop.quiet_cycles
+
+
 @pytest.mark.parametrize("protocol", CONFIGS)
 def test_lost_and_late_positions_and_a_stop_need_no_python(protocol: str, tmp_path: Path) -> None:
     """Otherwise the first cycle that is late makes the next ones late, too."""
     before: list[int] = []
-
-    def by_python(session: Session) -> int:
-        return session.loop.control.cycles - session.loop.quiet_cycles
 
     def script() -> dict[int, list[Happening]]:
         def ask(request: Request) -> Happening:
@@ -602,7 +607,7 @@ def test_lost_and_late_positions_and_a_stop_need_no_python(protocol: str, tmp_pa
             return Happening(lambda session: session.drives.faults.add(positions))
 
         happens = {30: [ask(CommandRequest(1, "ann", Command.ENABLE))]}
-        happens[299] = [Happening(lambda session: before.append(by_python(session)))]
+        happens[299] = [Happening(lambda session: before.append(cycles_by_python(session)))]
         for number, x in enumerate((0.05, -0.05, 0.05, -0.05)):
             begin = 300 + 300 * number
             happens[begin] = [ask(GoalRequest(10 + number, "ann", f"g{number}", PoseGoal(x, 0.0, 0.0), 0))]
@@ -613,7 +618,52 @@ def test_lost_and_late_positions_and_a_stop_need_no_python(protocol: str, tmp_pa
 
     session = both_ways(CONFIGS[protocol], tmp_path, script, CYCLES)
     assert sum(counts.feedback_lost for counts in session.driver.counts) >= 12
-    assert by_python(session) <= before[0] + 4
+    assert cycles_by_python(session) <= before[0] + 4
+
+
+def stops_first(seed: int) -> dict[int, list[Happening]]:
+    """Goals that are too slow to begin in motion, so that the robot first stops, and changes of the speed override."""
+    chance, tickets = random.Random(seed), iter(range(1, 1000))
+
+    def ask(request: Request) -> Happening:
+        return Happening(lambda session: session.ask(request))
+
+    happens = {30: [ask(CommandRequest(next(tickets), "ann", Command.ENABLE))]}
+    for number, begin in enumerate(range(200, CYCLES - 100, 150)):
+        x, y = 0.05 * (-1) ** (number // 2), chance.uniform(-0.02, 0.02)
+        goal = PoseGoal(x, y, 0.0, speed=0.02 if number % 2 else 1.0)
+        happens[begin] = [ask(GoalRequest(next(tickets), "ann", f"g{number}", goal, 0))]
+        rate = CommandRequest(
+            next(tickets), "ann", Command.OVERRIDE, carried(Command.OVERRIDE, chance.choice((0.3, 0.8, 1.2)))
+        )
+        if seed and number % 2:
+            happens[begin + chance.randrange(5, 60)] = [ask(rate)]
+    return happens
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("protocol", ["cia402", "odrive"])
+def test_a_motion_that_stops_before_the_next_one_needs_no_python(
+    protocol: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers: list[int] = []
+    by_python: list[int] = []
+    replace_runs = Schedule.replace_runs
+
+    def note(schedule: Schedule, runs: deque[Run]) -> None:
+        numbers.append(len(runs))
+        replace_runs(schedule, runs)
+
+    def generate() -> dict[int, list[Happening]]:
+        happens = stops_first(seed)
+        happens[199] = [Happening(lambda session: by_python.append(cycles_by_python(session)))]
+        return happens
+
+    monkeypatch.setattr(Schedule, "replace_runs", note)
+    session = both_ways(CONFIGS[protocol], tmp_path, generate, CYCLES)
+    assert numbers.count(2) >= 4
+    if not seed:  # a change of the override is computed step by step
+        assert cycles_by_python(session) - by_python[0] < 5
 
 
 def test_a_simulated_time_may_be_ahead_of_the_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,6 +73,8 @@ class SteadyState(NamedTuple):
     """Cycle after which Python must decide. If it has passed, or is -inf, Python must decide after every cycle."""
     settles_by: int | None
     """Cycle in which the in-position time-out of the current goal elapses; None if no goal is settling."""
+    later: tuple[float, float] | None
+    """Completed fraction of the current goal, and duration of the motions after `run` [s]; None if there are none."""
 
 
 class Control:
@@ -145,7 +147,7 @@ class Control:
         if self.outputs.any:
             self.outputs.follow_mode(mode)
             self._drives.set_outputs(self.outputs.words.tolist())
-        if len(runs) > 1 or (mode is Mode.STOPPING and not runs):
+        if mode is Mode.STOPPING and not runs:
             return None
         run = runs[0] if runs and not follows else None
         if run is not None and cycle.refusal(self._solve_code):
@@ -157,7 +159,8 @@ class Control:
         if self.ledger.busy or self._checks.due:
             until = self.cycles
         held = mode not in (Mode.DISABLED, Mode.FAULT)
-        return SteadyState(run, follows, held, self._at_rest, code, until, settling.ends)
+        later = self.schedule.later if run is not None else None
+        return SteadyState(run, follows, held, self._at_rest, code, until, settling.ends, later)
 
     @property
     def _follows(self) -> bool:
@@ -327,7 +330,7 @@ class Control:
             self._follow_measured()
             return
         self._check_solved(self.setpoints.solve(self.schedule, run))
-        if len(self.schedule.runs) > 1:
+        if self.schedule.later is not None:
             self.setpoints.record_progress(*self.schedule.progress)
 
     def _check_solved(self, code: int) -> None:

@@ -58,7 +58,21 @@ class Schedule:
         """Completed fraction of the current goal, 0 to 1, and the remaining time [s]."""
         if not self.runs:
             return 0.0, 0.0
-        *stops, run = self.runs
+        run = self.runs[0]
+        if self.later is None:
+            return run.progress, run.remaining
+        progress, remaining = self.later
+        return progress, run.end_time - run.time + remaining
+
+    @property
+    def later(self) -> tuple[float, float] | None:
+        """Completed fraction of the current goal, and duration of all runs after the first [s]; None if there are none.
+
+        The goal belongs to the last run; the runs before it only stop the previous motion.
+        """
+        if len(self.runs) < 2:
+            return None
+        _, *stops, run = self.runs
         return run.progress, run.remaining + sum(stop.end_time - stop.time for stop in stops)
 
     def replace_runs(self, runs: deque[Run]) -> None:

@@ -322,6 +322,8 @@ def solve(
             robot.refused_values,
             robot.record,
         )
+        if s.is_followed:
+            robot.record[0].progress, robot.record[0].remaining = s.later[0], s.duration - s.time + s.later[1]
     elif s.source == HOLD:
         code = cycle.hold(
             *(robot.legs, robot.bounds, robot.motion, robot.sliders, robot.backlash, robot.refused_values),

@@ -324,10 +324,10 @@ class QuietCycles:
     def _runs_beside(self) -> bool:
         """True if Python may decide beside the next cycles.
 
-        They then execute a motion or hold the robot, there is no other motion to follow, and there are no outputs.
-        Compiled code must not need Python to exchange frames.
+        They then execute a motion or hold the robot, and there are no outputs. Compiled code must not need Python to
+        exchange frames.
         """
-        if self._lent is None or self._state.source == quiet.FOLLOW or len(self._control.schedule.runs) > 1:
+        if self._lent is None or self._state.source == quiet.FOLLOW:
             return False
         return not (self._control.outputs.any or self._calls_python)
 
@@ -390,6 +390,9 @@ class QuietCycles:
         state.time = runs[0].time if runs else 0.0
         if run is not None:
             state.in_sliders, state.target, state.course = run.path.in_sliders, run.target, run.goal_span
+            state.is_followed = steady.later is not None
+            if steady.later is not None:
+                state.duration, state.later = run.end_time, steady.later
 
     def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
         """Return the arguments of the compiled function that stay the same while the drives lend their tables."""

@@ -15,6 +15,8 @@ Unsigned = int
 """Counter of trirail.processes.heartbeats."""
 PartTimes = MutableSequence[int]
 """Durations of the parts of a cycle, in the order of trirail.wire.records.Part [ns]."""
+Pair = tuple[float, float]
+"""Values of a trirail.control.control.SteadyState.later."""
 Span = tuple[float, float, float]
 """Values of a trirail.motion.runs.GoalSpan."""
 
@@ -92,6 +94,12 @@ class QuietState(ctypes.Structure):
     course: Span
     code: int
     """Result of trirail.control.cycle.command."""
+    is_followed: bool
+    """Whether another motion follows at the end of the motion."""
+    duration: float
+    """Duration of the law of a motion that is followed by another [s]."""
+    later: Pair
+    """Completed fraction of the current goal, and duration of the motions that follow [s]."""
     settles: bool
     """Whether a goal waits until the robot is in position."""
     timeout: int
@@ -154,6 +162,7 @@ _KINDS: Final[dict[str, Any]] = {
     "bool": ctypes.c_bool,
     "Unsigned": ctypes.c_uint64,
     "PartTimes": ctypes.c_int32 * len(Part),
+    "Pair": ctypes.c_double * 2,
     "Span": ctypes.c_double * 3,
 }
 QuietState._fields_ = [(name, _KINDS[kind]) for name, kind in inspect.get_annotations(QuietState).items()]
