@@ -15,12 +15,14 @@ from control_rig import carried
 from msgspec import structs
 from numpy.typing import NDArray
 from processes.test_quiet import CONFIGS, CYCLES, Happening, Session, requests_of_two, script, stops_first
+from processes.test_quiet_outputs import INPUTS
 from trirail.analysis import replay
 from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
-from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
+from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
+from trirail.wire.marks import StopAt
 from trirail.wire.packets import (
     CommandRequest,
     ControlInput,
@@ -32,7 +34,7 @@ from trirail.wire.packets import (
 )
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, Command, Mode
-from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.can_frame import CAN_FRAME, ERROR
 
 REFUSED = re.compile("no setpoint|setpoint refused")
 """What the last gate says."""
@@ -194,6 +196,72 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
             assert len(modes) < 3 or modes[2] is not Mode.MOVING
     if mishap not in ("a late tick", "late frames", "silence"):
         assert {*happened} - {Reached.DONE}, "some of it needed Python"
+
+
+@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("seed", range(3))
+def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
+    seed: int, number: int, tmp_path: Path
+) -> None:
+    """It takes effect after the cycles beside the decision, at the latest."""
+    chance = random.Random(seed)
+    config = structs.replace(CONFIGS["cia402"], inputs=INPUTS)
+    session = Session(config, tmp_path, "unix", quiet=True)
+    quiet = quiet_of(session)
+    quiet.beside = number, number
+    run_beside = quiet.run_beside
+    pressed: list[tuple[int, bool]] = []
+
+    def ambushed(*arguments: Any) -> Any:
+        if chance.random() < 0.3:
+            on = not (pressed and pressed[-1][1])
+            pressed.append((quiet._state.cycle, on))
+            session.drives.press(1, on << INPUTS["part"].bit)
+        return run_beside(*arguments)
+
+    quiet.run_beside = ambushed  # type: ignore[assignment, method-assign]
+    happens = {30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))]}
+    for at in range(200, CYCLES - 40, 160):
+        for later in (20, 35, 50):
+            refused = CommandRequest(5000 + at + later, "ann", Command.ENABLE)
+            happens[at + later] = [Happening(lambda session, refused=refused: session.ask(refused))]  # type: ignore[misc]
+        stop_at = StopAt("part", chance.choice(("rising", "falling")))
+        goal = PoseGoal(chance.uniform(-0.05, 0.05), chance.uniform(-0.05, 0.05), 0.0, stop_at=stop_at)
+        request = GoalRequest(at, "ann", f"g{at}", goal, 0)
+        happens[at] = [Happening(lambda session, request=request: session.ask(request))]  # type: ignore[misc]
+    try:
+        records, inputs, events = recorded(session, happens, CYCLES)
+    finally:
+        session.close()
+    reported = [(each.event.cycle, each.event.message) for each in events if each.event.kind == "input"]
+    assert len(pressed) > 5
+    assert ["switched on" in message for _, message in reported] == [on for _, on in pressed]
+    assert all(0 <= at - cycle <= 1 + number for (at, _), (cycle, _) in zip(reported, pressed, strict=True))
+    assert any("done: input part" in each.event.message for each in events)
+    differs = replayed(config, records, inputs)
+    assert not differs.any(), int(np.argmax(differs)) + 1
+
+
+def test_a_warning_of_the_bus_beside_a_decision_is_reported(tmp_path: Path) -> None:
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    quiet = quiet_of(session)
+    quiet.beside = 2, 2
+    run_beside, began = quiet.run_beside, []
+
+    def ambushed(*arguments: Any) -> Any:
+        began.append(quiet._state.cycle)
+        if len(began) == 5:
+            session.inject(CAN_FRAME.pack(ERROR | 0x004, 8, bytes((0, 0x10)).ljust(8, b"\0")))  # error-passive
+        return run_beside(*arguments)
+
+    quiet.run_beside = ambushed  # type: ignore[assignment, method-assign]
+    try:
+        _, _, events = recorded(session, script(1), CYCLES)
+    finally:
+        session.close()
+    reported = [each.event.cycle for each in events if "error-passive" in each.event.message]
+    assert len(reported) == 1
+    assert 0 <= reported[0] - began[4] <= 3
 
 
 PATHS = ((200, 0.2), (500, 0.2345), (800, 0.25), (1100, 0.3))

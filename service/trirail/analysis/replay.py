@@ -255,6 +255,7 @@ class _Ahead:
             control.modes.cycle += 1
         else:
             self._decide()
+            control.end_ahead()
 
     def _decide(self) -> None:
         """Decide with the feedback from before the cycles beside the decision."""

@@ -119,6 +119,8 @@ class Control:
         """Whether the setpoints of the current cycle have been sent."""
         self.ahead = 0
         """Number of cycles between the newest feedback that the control knows and the present commanded motion."""
+        self._edges: list[tuple[str, bool, Triple]] = []
+        """Digital inputs that have changed: name, new value, and pose of the robot. They have not been handled yet."""
 
     @property
     def cycles(self) -> int:
@@ -219,6 +221,13 @@ class Control:
         schedule, setpoints = self.schedule, self.setpoints
         return schedule.motion, setpoints.sliders, setpoints.bounds, setpoints.refused_values, self.measured.backlash
 
+    def end_ahead(self) -> None:
+        """Let a decision take effect that was made beside the newest cycles, and handle edges of inputs among them."""
+        self.ahead = 0
+        if self._edges:
+            self._handle_edges()
+            self.decide(())
+
     def return_to(self, newest: int) -> None:
         """Continue after cycle `newest`, although later cycles were foreseen; only for a fault that stops the robot."""
         self.schedule.cycle += newest - self.cycles
@@ -288,8 +297,9 @@ class Control:
         before = self.measured.feedback
         if behind is None:
             behind = self.measured.update(feedback, self._at_rest)
-        self._report_warnings(feedback)
-        self._handle_edges(before, feedback)
+        self.report_feedback(before, feedback)
+        if not self.ahead:
+            self._handle_edges()
         mode = self.state.mode
         if feedback.fault is not None:
             drive, cause, code, message = feedback.fault
@@ -310,6 +320,16 @@ class Control:
                 self.modes.trip(text, FaultCause.FOLLOWING_ERROR, NAMES[behind - 1])
             elif not feedback.homing:
                 self._end_homing()
+
+    def report_feedback(self, before: Feedback, feedback: Feedback) -> None:
+        """Report warnings in the feedback of a cycle, and note the digital inputs that have changed in this cycle.
+
+        A goal that ends at such an edge is stopped in this cycle or, if the cycle runs beside a decision, when the
+        decision takes effect (end_ahead).
+        """
+        self._report_warnings(feedback)
+        changed = self.outputs.edges(before.inputs, feedback.inputs)
+        self._edges += [(name, value, self.measured.pose) for name, value in changed]
 
     def _report_warnings(self, feedback: Feedback) -> None:
         """Report warnings of the drives, and drives that were lost or have returned.
@@ -363,11 +383,11 @@ class Control:
             )
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
 
-    def _handle_edges(self, before: Feedback, now: Feedback) -> None:
+    def _handle_edges(self) -> None:
         """Report digital inputs that have changed, and stop the current goal if it ends at one of these edges."""
-        goal, pose = self.ledger.goal, self.measured.pose
-        x, y, phi = pose
-        for name, value in self.outputs.edges(before.inputs, now.inputs):
+        goal, edges = self.ledger.goal, self._edges
+        self._edges = []
+        for name, value, (x, y, phi) in edges:
             words = (
                 f"input {name} switched {'on' if value else 'off'} at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm, phi "
                 f"{phi:.5f} rad"

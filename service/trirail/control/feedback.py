@@ -25,8 +25,12 @@ CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerSta
 """States in which a drive can move its slider."""
 
 
-def pack_feedback(feedback: Feedback, numbers: NDArray[np.void]) -> None:
-    """Write the numeric fields of a feedback to element 0 of an array of dtype trirail.control.cycle.FEEDBACK."""
+def pack_feedback(feedback: Feedback, numbers: NDArray[np.void], record: NDArray[np.void]) -> None:
+    """Write the numeric fields of a feedback to element 0 of an array of dtype trirail.control.cycle.FEEDBACK.
+
+    The digital inputs are written directly to the record of the cycle.
+    """
+    record["inputs"] = feedback.inputs
     cycle.FEEDBACK_STRUCT.pack_into(
         numbers.view(np.uint8).data,
         0,
@@ -194,8 +198,7 @@ class MeasuredState:
 
     def _pack(self, feedback: Feedback) -> None:
         self.feedback = feedback
-        pack_feedback(feedback, self.numbers)
-        self.record["inputs"] = feedback.inputs
+        pack_feedback(feedback, self.numbers, self.record)
 
     def _recorded(self, field: str) -> Triple:
         x, y, z = self.record[field][0].tolist()

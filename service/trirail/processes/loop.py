@@ -239,7 +239,7 @@ class Loop:
         self._listened = self._never_listens
         self._finish_beside(quiet, ticker, newest, last)
         self.control.modes.send_commands()
-        self.control.ahead = 0
+        self.control.end_ahead()
         self._send_beside(reports=True)
 
     def _finish_beside(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
@@ -270,7 +270,10 @@ class Loop:
                     self._end(tick)
                     return
                 self._overruns.all += tick.missed
-                reached = quiet.solve(feedback, tick)
+                before = self.control.measured.feedback
+                reached = quiet.solve(feedback._replace(warnings=()), tick)  # reported below, and only once
+                quiet.copy_measured_back()
+                self.control.report_feedback(before, feedback)
             if quiet.is_refused(reached):
                 self._end_ahead(quiet, done)
                 self._continue_solved(quiet.result(reached))

@@ -297,7 +297,7 @@ class QuietCycles:
         state = self._state
         state.deadline_ns, state.lateness_ns, state.missed = tick
         self._control.measured.feedback = feedback
-        pack_feedback(feedback, self._robot.feedback)
+        pack_feedback(feedback, self._robot.feedback, self._robot.record)
         first, moment, frames, robot = self._tables
         reached = quiet.solve(first, moment, frames, robot, self._motion[0])
         return Reached.SOLVED if reached == quiet.CONTINUE else Reached(reached)
