@@ -15,7 +15,9 @@ from control_rig import carried
 from msgspec import structs
 from numpy.typing import NDArray
 from processes.test_quiet import CONFIGS, CYCLES, Happening, Session, requests_of_two, script, stops_first
-from processes.test_quiet_outputs import INPUTS
+from processes.test_quiet_outputs import CYCLES as OUTPUT_CYCLES
+from processes.test_quiet_outputs import INPUTS, OUTPUTS, PINS, changes
+from processes.test_quiet_outputs import session as session_with_outputs
 from trirail.analysis import replay
 from trirail.config import Config
 from trirail.control.control import Control
@@ -35,6 +37,7 @@ from trirail.wire.packets import (
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME, ERROR
+from trirail_drivers.simulated import SimulatedDrive
 
 REFUSED = re.compile("no setpoint|setpoint refused")
 """What the last gate says."""
@@ -74,10 +77,10 @@ def replayed(config: Config, records: NDArray[np.void], inputs: list[ControlInpu
     drives, planner = replay._RecordedDrives(records), replay._RecordedPlanner(config)
     clock = replay._SimulatedClock(config.period)
     control = Control(config, drives, planner)
-    setpoints, modes, _ = replay._run(control, drives, planner, clock, records, inputs)
+    setpoints, modes, outputs = replay._run(control, drives, planner, clock, records, inputs)
     told = np.stack([records[name] for name in replay.SETPOINT_FIELDS], axis=1)
     differs = (setpoints.view(np.int64) != told.view(np.int64)).any(axis=(1, 2))
-    result: NDArray[np.bool] = differs | (modes != records["mode"])
+    result: NDArray[np.bool] = differs | (modes != records["mode"]) | (outputs != records["outputs"]).any(axis=1)
     return result
 
 
@@ -240,6 +243,29 @@ def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
     assert any("done: input part" in each.event.message for each in events)
     differs = replayed(config, records, inputs)
     assert not differs.any(), int(np.argmax(differs)) + 1
+
+
+@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("seed", range(4))
+def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: int, tmp_path: Path) -> None:
+    session = Session(PINS, tmp_path, "unix", quiet=True)
+    quiet_of(session).beside = number, number
+    try:
+        records, inputs, events = recorded(session, session_with_outputs(seed), OUTPUT_CYCLES)
+    finally:
+        session.close()
+    ahead = [each.given.cycles for each in inputs if isinstance(each.given, DecidedAhead)]
+    assert ahead.count(number) > 10
+    differs = replayed(PINS, records, inputs)
+    assert not differs.any(), int(np.argmax(differs)) + 1
+    valve = session.drives.drives[0]
+    assert isinstance(valve, SimulatedDrive)
+    recorded_words = [0, *records["outputs"][:, 0].tolist()]
+    assert [change.bits for change in valve.pins.history] == changes(recorded_words)
+    switches = [switch for each in events for switch in each.event.marks or () if switch.output == "valve"]
+    assert len(switches) > 10
+    for switch in switches:
+        assert records["outputs"][switch.cycle - 1, 0] == (switch.value << OUTPUTS["valve"].bit)
 
 
 def test_a_warning_of_the_bus_beside_a_decision_is_reported(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from trirail_drivers.driver.cyclic import MOST_FRAMES
 from trirail.control import cycle, outputs
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
+from trirail.motion.paths import law_at
 from trirail.processes.clock import POLLFDS, busy_wait, called, now_ns, sleep, wait
 from trirail.processes.cycle_frames import (
     AXES,
@@ -401,13 +402,31 @@ def copy_state(copies: NDArray[np.int64], back: bool) -> None:
 
 
 @compiled()
-def _cycles_beside(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
+def _may_switch(s: Any, motion: MotionArrays, tables: OutputArrays) -> bool:
+    """Return True if an output may switch in one of the next cycles that could run beside a decision."""
+    for k in range(len(tables.switches)):
+        output = tables.switches[k]
+        if output.until != 0 and output.until <= s.cycle + s.most:
+            return True
+        if s.source == COMMAND and output.next < output.end:
+            # An output switches with the nearest setpoint, half a period early at most; one period more for rounding.
+            time = s.time + (s.most + 2) * s.period + output.delay
+            if tables.planned[output.next].s <= law_at(motion.law_knots, motion.law_pieces, time)[0]:
+                return True
+    return False
+
+
+@compiled()
+def _cycles_beside(
+    state: NDArray[np.void], moment: NDArray[np.int64], motion: MotionArrays, tables: OutputArrays
+) -> int:
     """Return the number of cycles that must run beside a decision, so that none is late; 0 to decide before the next.
 
-    A decision that is due in a certain cycle, or at the end of a motion, is made for exactly that cycle.
+    A decision that is due in a certain cycle, or at the end of a motion, is made for exactly that cycle. No output
+    switches beside a decision, because decisions change outputs as well.
     """
     s = state[0]
-    if s.most == 0:
+    if s.most == 0 or _may_switch(s, motion, tables):
         return 0
     missing_ns = s.budget_ns - (s.deadline_ns + s.period_ns - _now_ns(state, moment))
     until_due = min(s.due if s.due >= s.cycle else NO_CYCLE, s.ends) - s.cycle
@@ -468,7 +487,7 @@ def _run_cycles(
         if not accepted:
             return Reached.WRITTEN
         if (s.called or s.decides) and not s.beside:
-            number = _cycles_beside(state, moment)
+            number = _cycles_beside(state, moment, motion, tables)
             if number == 0:
                 return Reached.DONE
             _request_decision(state, moment, number, copies)

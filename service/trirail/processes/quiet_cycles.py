@@ -153,6 +153,9 @@ class QuietCycles:
         self._robot = self._robot_arrays()
         self._measured_table = self._measured.table
         self._robot_table = np.concatenate((self._measured_table, self._commanded.table))
+        self._outputs = _Copies()
+        self._output_state = self._outputs.add(control.outputs.state)
+        self._output_words = self._outputs.add(control.outputs.words)
         self._table = self._robot_table
         state = self._state
         self.parts_ns = state.parts_ns
@@ -231,6 +234,7 @@ class QuietCycles:
     def _answer(self) -> None:
         """Decide beside the cycles."""
         state = self._state
+        self._control.outputs.update_log(state.logged, state.report_due)
         request = state.requested, state.until - state.requested, state.requested_deadline_ns, state.requested_ns
         self._decide(DecisionRequest(*request, state.requested_called, state.requested_time))
 
@@ -324,12 +328,9 @@ class QuietCycles:
     def _runs_beside(self) -> bool:
         """True if Python may decide beside the next cycles.
 
-        They then execute a motion or hold the robot, and there are no outputs. Compiled code must not need Python to
-        exchange frames.
+        They then execute a motion or hold the robot. Compiled code must not need Python to exchange frames.
         """
-        if self._lent is None or self._state.source == quiet.FOLLOW:
-            return False
-        return not (self._control.outputs.any or self._calls_python)
+        return self._lent is not None and self._state.source != quiet.FOLLOW and not self._calls_python
 
     @property
     def _calls_python(self) -> bool:
@@ -341,8 +342,8 @@ class QuietCycles:
         quiet.copy_state(self._measured_table, True)
 
     def copy_back(self) -> None:
-        """Copy the whole state of the robot back from compiled code."""
-        quiet.copy_state(self._table, True)
+        """Copy the whole state of the robot back from compiled code, without the outputs, which it has not changed."""
+        quiet.copy_state(np.concatenate((self._robot_table, self._furthest.table)), True)
 
     def _neighbours(self) -> quiet.Neighbours:
         return quiet.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
@@ -440,8 +441,8 @@ class QuietCycles:
         path, law = (run.path, run.law) if run is not None else (_EMPTY_PATH, _IDLE_LAW)
         self._furthest = _Copies()
         furthest = self._furthest.add(run.furthest if run is not None else self._nothing)
-        self._table = np.concatenate((self._robot_table, self._furthest.table))
+        self._table = np.concatenate((self._robot_table, self._outputs.table, self._furthest.table))
         outputs = self._control.outputs
         outputs.prepare(run, self._control.schedule.version)
         motion = quiet.MotionArrays(path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest)
-        return motion, quiet.OutputArrays(outputs.state, outputs.planned, outputs.words, outputs.log)
+        return motion, quiet.OutputArrays(self._output_state, outputs.planned, self._output_words, outputs.log)
