@@ -134,6 +134,12 @@ def test_cycles_beside_a_decision_are_recorded_at_a_rate_at_which_a_batch_has_fe
     assert not replayed(config, records, inputs).any()
 
 
+def ask_before_decision(session: Session, command: Command) -> None:
+    """Send a command so that the requested decision reads it, before compiled code notices that it is urgent."""
+    session.ask(CommandRequest(8000, "ann", command))
+    quiet_of(session)._state.requested_called = True
+
+
 MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
     "a strange frame": lambda session, _: session.inject(CAN_FRAME.pack(0x123, 2, b"ab")),
     "a statusword": lambda session, chance: session.inject(
@@ -148,6 +154,7 @@ MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
     "a full bus": lambda session, chance: setattr(session, "room", chance.randrange(4)),
     "a stop": lambda session, _: session.ask(CommandRequest(8000, "ann", Command.STOP, carried(Command.STOP))),
     "a quick stop": lambda session, _: session.ask(CommandRequest(8000, "ann", Command.QUICK_STOP)),
+    "a quick stop before the decision": lambda session, _: ask_before_decision(session, Command.QUICK_STOP),
     "a late tick": lambda session, chance: setattr(session, "late_ns", chance.choice((300_000, 900_000, 2_500_000))),
 }
 """What happens while cycles run beside a decision."""
@@ -193,7 +200,7 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
     assert not differs.any(), (int(np.argmax(differs)) + 1, mishap)
     for cycle in began:
         modes = [MODES[each] for each in records["mode"][cycle : cycle + 3]]
-        if mishap == "a quick stop":
+        if mishap.startswith("a quick stop"):
             assert modes[0] is Mode.FAULT
         elif mishap == "a stop":
             assert len(modes) < 3 or modes[2] is not Mode.MOVING

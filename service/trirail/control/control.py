@@ -232,6 +232,7 @@ class Control:
         """Continue after cycle `newest`, although later cycles were foreseen; only for a fault that stops the robot."""
         self.schedule.cycle += newest - self.cycles
         self.modes.cycle = newest + 1
+        self.modes.entered = min(self.modes.entered, self.modes.cycle)
 
     def cycle(self, read: Callable[[], Feedback], inputs: Iterable[TimedInput] = ()) -> None:
         """Run one complete cycle: handle the inputs, `read` the feedback, execute the cycle, and evaluate it."""

@@ -245,14 +245,15 @@ class Loop:
     def _finish_beside(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
         """Finish the cycles beside which the control has decided, up to cycle `last`, if they have needed Python.
 
-        They go on with the motion from before the decision. A fault or a quick stop ends them.
+        They go on with the motion from before the decision. A fault or a quick stop ends them, even if the decision has
+        already handled the quick stop.
         """
         reached, tick, done = newest.reached, newest.tick, newest.cycle
         if reached is not Reached.DONE:
             quiet.leave_at(reached)
         if reached is Reached.WRITTEN:
             quiet.send_on()
-        if reached is Reached.SYNCED and self._quick_stop_waits():
+        if reached is Reached.SYNCED and (self.control.state.mode is Mode.FAULT or self._quick_stop_waits()):
             self._end_ahead(quiet, done)
             self._continue_after_sync(tick)
             return
