@@ -65,7 +65,7 @@ def main() -> int:
     """Run the test; return the exit code, which is 0 only if all checks passed."""
     parser = argparse.ArgumentParser(description="The service on real SocketCAN, in a machine that QEMU emulates.")
     parser.add_argument("--install", action="store_true", help="install missing Debian packages first (as root)")
-    parser.add_argument("--timeout", type=float, default=1500.0, help="of the whole run [s]; default 1500")
+    parser.add_argument("--timeout", type=float, default=2100.0, help="of the whole run [s]; default 2100")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where to leave the logs")
     parser.add_argument("--only", choices=STEPS, help="run only one step: two robots, a robot on CAN FD, or the tests")
     parser.add_argument("--json", action="store_true", help="print one JSON object; progress goes to standard error")

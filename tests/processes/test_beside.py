@@ -162,7 +162,7 @@ MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
 
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.parametrize("mishap", MISHAPS)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.generated(1, 2)
 def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
     mishap: str, number: int, seed: int, tmp_path: Path
 ) -> None:
@@ -209,7 +209,7 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
 
 
 @pytest.mark.parametrize("number", [1, 2])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.generated(1, 2, 0)
 def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
     seed: int, number: int, tmp_path: Path
 ) -> None:
@@ -253,7 +253,7 @@ def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
 
 
 @pytest.mark.parametrize("number", [1, 2])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.generated(0, 1, 2, 3)
 def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: int, tmp_path: Path) -> None:
     session = Session(PINS, tmp_path, "unix", quiet=True)
     quiet_of(session).beside = number, number
@@ -323,7 +323,7 @@ def path_lengths(session: Session, disturbed_at: list[int]) -> tuple[list[int], 
     return np.diff(changes)[::2].tolist(), any(isinstance(each.given, DecidedAhead) for each in inputs)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.generated(0, 2, 3, 4, 5, 1)
 def test_a_path_ends_in_the_same_cycle_as_without_cycles_beside_decisions(seed: int, tmp_path: Path) -> None:
     """It does so even if other requests arrive in its last cycles, and if decisions take more time than expected."""
     chance = random.Random(seed)

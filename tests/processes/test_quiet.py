@@ -424,7 +424,7 @@ def test_quiet_cycles_are_those_of_python_to_the_last_bit(
     both_ways(CONFIGS[protocol], tmp_path, lambda: script(seed, protocol), CYCLES, carrier)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.generated(0, 1, 2)
 def test_a_session_on_can_fd_sends_what_it_sends_on_classical_can(seed: int, tmp_path: Path) -> None:
     """In the same order and to the last bit; each frame is one of CAN FD. What is injected is of classical CAN."""
     places = [tmp_path / name for name in ("classical", "fd")]
@@ -641,7 +641,7 @@ def stops_first(seed: int) -> dict[int, list[Happening]]:
     return happens
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.generated(1, 2, 3, 0)
 @pytest.mark.parametrize("protocol", ["cia402", "odrive"])
 def test_a_motion_that_stops_before_the_next_one_needs_no_python(
     protocol: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -763,7 +763,7 @@ def test_who_stays_at_the_door_unheard_keeps_no_tick_waiting(quiet: bool, tmp_pa
         session.close()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.generated(*range(6))
 def test_who_enables_while_sliders_are_pushed_by_hand_is_answered_alike(seed: int, tmp_path: Path) -> None:
     """It depends on where the sliders are now, and whether they stand."""
 
