@@ -208,6 +208,36 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
         assert {*happened} - {Reached.DONE}, "some of it needed Python"
 
 
+def test_a_quick_stop_in_the_second_cycle_beside_a_decision_is_handled_in_it(tmp_path: Path) -> None:
+    """It is, even if the first of these cycles has needed Python."""
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    quiet = quiet_of(session)
+    quiet.beside = 2, 2
+    run_beside, record, asked = quiet.run_beside, quiet.record, []
+
+    def ambushed(*arguments: Any) -> Any:
+        state = quiet._state
+        if state.cycle > 300 and state.until == state.requested + 2 and not asked:
+            session.inject(CAN_FRAME.pack(0x123, 2, b"ab"))  # for Python
+        return run_beside(*arguments)
+
+    def recorded_first(overruns: Any) -> int:
+        number = record(overruns)
+        if not asked:
+            asked.append(number)
+            session.ask(CommandRequest(8000, "ann", Command.QUICK_STOP))
+        return number
+
+    quiet.run_beside, quiet.record = ambushed, recorded_first  # type: ignore[assignment, method-assign]
+    try:
+        records, inputs, _ = recorded(session, script(1), CYCLES)
+    finally:
+        session.close()
+    assert not replayed(CONFIGS["cia402"], records, inputs).any()
+    assert MODES[records["mode"][asked[0] - 1]] is not Mode.FAULT
+    assert MODES[records["mode"][asked[0]]] is Mode.FAULT
+
+
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.generated(1, 2, 0)
 def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(

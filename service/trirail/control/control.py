@@ -73,8 +73,8 @@ class SteadyState(NamedTuple):
     """Cycle after which Python must decide. If it has passed, or is -inf, Python must decide after every cycle."""
     settles_by: int | None
     """Cycle in which the in-position time-out of the current goal elapses; None if no goal is settling."""
-    later: tuple[float, float] | None
-    """Completed fraction of the current goal, and duration of the motions after `run` [s]; None if there are none."""
+    after_stop: tuple[float, float] | None
+    """Value of trirail.motion.schedule.Schedule.after_stop, if there is a motion."""
 
 
 class Control:
@@ -161,8 +161,8 @@ class Control:
         if self.ledger.busy or self._checks.due:
             until = self.cycles
         held = mode not in (Mode.DISABLED, Mode.FAULT)
-        later = self.schedule.later if run is not None else None
-        return SteadyState(run, follows, held, self._at_rest, code, until, settling.ends, later)
+        after_stop = self.schedule.after_stop if run is not None else None
+        return SteadyState(run, follows, held, self._at_rest, code, until, settling.ends, after_stop)
 
     @property
     def _follows(self) -> bool:
@@ -351,7 +351,7 @@ class Control:
             self._follow_measured()
             return
         self._check_solved(self.setpoints.solve(self.schedule, run))
-        if self.schedule.later is not None:
+        if len(self.schedule.runs) > 1:
             self.setpoints.record_progress(*self.schedule.progress)
 
     def _check_solved(self, code: int) -> None:

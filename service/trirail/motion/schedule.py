@@ -58,17 +58,17 @@ class Schedule:
         """Completed fraction of the current goal, 0 to 1, and the remaining time [s]."""
         if not self.runs:
             return 0.0, 0.0
-        run = self.runs[0]
-        if self.later is None:
+        run, after_stop = self.runs[0], self.after_stop
+        if after_stop is None:
             return run.progress, run.remaining
-        progress, remaining = self.later
+        progress, remaining = after_stop
         return progress, run.end_time - run.time + remaining
 
     @property
-    def later(self) -> tuple[float, float] | None:
+    def after_stop(self) -> tuple[float, float] | None:
         """Completed fraction of the current goal, and duration of all runs after the first [s]; None if there are none.
 
-        The goal belongs to the last run; the runs before it only stop the previous motion.
+        The goal belongs to the last run. The runs before it only stop the previous motion.
         """
         if len(self.runs) < 2:
             return None

@@ -253,16 +253,16 @@ class Loop:
             quiet.leave_at(reached)
         if reached is Reached.WRITTEN:
             quiet.send_on()
-        if reached is Reached.SYNCED and (self.control.state.mode is Mode.FAULT or self._quick_stop_waits()):
-            self._end_ahead(quiet, done)
-            self._continue_after_sync(tick)
-            return
         while reached in (Reached.OBSERVED, Reached.SOLVED) or done < last:
             if reached not in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED):
                 tick = ticker.tick() if reached is Reached.WAITED else ticker.wait()
                 self._drives.sync()
                 reached = Reached.SYNCED
             if reached is Reached.SYNCED:
+                if self.control.state.mode is Mode.FAULT or self._quick_stop_waits():
+                    self._end_ahead(quiet, done)
+                    self._continue_after_sync(tick)
+                    return
                 feedback = self._drives.read()
                 if feedback.fault is not None:
                     self._end_ahead(quiet, done)

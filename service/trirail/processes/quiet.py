@@ -323,8 +323,9 @@ def solve(
             robot.refused_values,
             robot.record,
         )
-        if s.is_followed:
-            robot.record[0].progress, robot.record[0].remaining = s.later[0], s.duration - s.time + s.later[1]
+        if s.stops_first:
+            progress, remaining = s.after_stop
+            robot.record[0].progress, robot.record[0].remaining = progress, s.stop_duration - s.time + remaining
     elif s.source == HOLD:
         code = cycle.hold(
             *(robot.legs, robot.bounds, robot.motion, robot.sliders, robot.backlash, robot.refused_values),

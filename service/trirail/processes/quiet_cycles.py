@@ -391,9 +391,9 @@ class QuietCycles:
         state.time = runs[0].time if runs else 0.0
         if run is not None:
             state.in_sliders, state.target, state.course = run.path.in_sliders, run.target, run.goal_span
-            state.is_followed = steady.later is not None
-            if steady.later is not None:
-                state.duration, state.later = run.end_time, steady.later
+            state.stops_first = steady.after_stop is not None
+            if steady.after_stop is not None:
+                state.stop_duration, state.after_stop = run.end_time, steady.after_stop
 
     def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
         """Return the arguments of the compiled function that stay the same while the drives lend their tables."""

@@ -16,7 +16,7 @@ Unsigned = int
 PartTimes = MutableSequence[int]
 """Durations of the parts of a cycle, in the order of trirail.wire.records.Part [ns]."""
 Pair = tuple[float, float]
-"""Values of a trirail.control.control.SteadyState.later."""
+"""Values of trirail.motion.schedule.Schedule.after_stop."""
 Span = tuple[float, float, float]
 """Values of a trirail.motion.runs.GoalSpan."""
 
@@ -94,12 +94,12 @@ class QuietState(ctypes.Structure):
     course: Span
     code: int
     """Result of trirail.control.cycle.command."""
-    is_followed: bool
-    """Whether another motion follows at the end of the motion."""
-    duration: float
-    """Duration of the law of a motion that is followed by another [s]."""
-    later: Pair
-    """Completed fraction of the current goal, and duration of the motions that follow [s]."""
+    stops_first: bool
+    """Whether the motion only stops the robot before the motion of the current goal."""
+    stop_duration: float
+    """Duration of the law of such a motion [s]."""
+    after_stop: Pair
+    """Completed fraction of the current goal, and duration of the motions after the stop [s]."""
     settles: bool
     """Whether a goal waits until the robot is in position."""
     timeout: int
