@@ -40,7 +40,7 @@ from trirail_drivers.bus.can_frame import CAN_FRAME, ERROR
 from trirail_drivers.simulated import SimulatedDrive
 
 REFUSED = re.compile("no setpoint|setpoint refused")
-"""What the last gate says."""
+"""Message of the last gate."""
 
 
 def quiet_of(session: Session) -> QuietCycles:
@@ -67,19 +67,19 @@ def recorded(
     while keep() is not None:
         pass
     rows = b"".join(packet[1:] for packet in packets if packet[0] == Kind.RECORDS)
-    said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
-    inputs = [each for each in said if isinstance(each, ControlInput)]
-    return np.frombuffer(rows, DTYPE), inputs, [each for each in said if isinstance(each, EventReport)]
+    messages = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
+    inputs = [each for each in messages if isinstance(each, ControlInput)]
+    return np.frombuffer(rows, DTYPE), inputs, [each for each in messages if isinstance(each, EventReport)]
 
 
 def replayed(config: Config, records: NDArray[np.void], inputs: list[ControlInput]) -> NDArray[np.bool]:
-    """Return for each cycle whether its replay differs from what was recorded."""
+    """Return for each cycle whether its replay differs from its record."""
     drives, planner = replay._RecordedDrives(records), replay._RecordedPlanner(config)
     clock = replay._SimulatedClock(config.period)
     control = Control(config, drives, planner)
     setpoints, modes, outputs = replay._run(control, drives, planner, clock, records, inputs)
-    told = np.stack([records[name] for name in replay.SETPOINT_FIELDS], axis=1)
-    differs = (setpoints.view(np.int64) != told.view(np.int64)).any(axis=(1, 2))
+    commanded = np.stack([records[name] for name in replay.SETPOINT_FIELDS], axis=1)
+    differs = (setpoints.view(np.int64) != commanded.view(np.int64)).any(axis=(1, 2))
     result: NDArray[np.bool] = differs | (modes != records["mode"]) | (outputs != records["outputs"]).any(axis=1)
     return result
 
@@ -157,7 +157,7 @@ MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
     "a quick stop before the decision": lambda session, _: ask_before_decision(session, Command.QUICK_STOP),
     "a late tick": lambda session, chance: setattr(session, "late_ns", chance.choice((300_000, 900_000, 2_500_000))),
 }
-"""What happens while cycles run beside a decision."""
+"""Events while cycles run beside a decision."""
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -209,11 +209,12 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
 
 
 def test_a_quick_stop_in_the_second_cycle_beside_a_decision_is_handled_in_it(tmp_path: Path) -> None:
-    """It is, even if the first of these cycles has needed Python."""
+    """The first of these cycles needs Python, so that Python runs the second as well."""
     session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
     quiet = quiet_of(session)
     quiet.beside = 2, 2
-    run_beside, record, asked = quiet.run_beside, quiet.record, []
+    run_beside, record = quiet.run_beside, quiet.record
+    asked: list[int] = []
 
     def ambushed(*arguments: Any) -> Any:
         state = quiet._state
@@ -243,7 +244,7 @@ def test_a_quick_stop_in_the_second_cycle_beside_a_decision_is_handled_in_it(tmp
 def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
     seed: int, number: int, tmp_path: Path
 ) -> None:
-    """It takes effect after the cycles beside the decision, at the latest."""
+    """The edge takes effect after the cycles beside the decision, at the latest."""
     chance = random.Random(seed)
     config = structs.replace(CONFIGS["cia402"], inputs=INPUTS)
     session = Session(config, tmp_path, "unix", quiet=True)
@@ -355,7 +356,7 @@ def path_lengths(session: Session, disturbed_at: list[int]) -> tuple[list[int], 
 
 @pytest.mark.generated(0, 2, 3, 4, 5, 1)
 def test_a_path_ends_in_the_same_cycle_as_without_cycles_beside_decisions(seed: int, tmp_path: Path) -> None:
-    """It does so even if other requests arrive in its last cycles, and if decisions take more time than expected."""
+    """Other requests arrive in its last cycles, and decisions take more time than expected."""
     chance = random.Random(seed)
     ends = [at + round(1e3 * duration) for at, duration in PATHS]
     disturbed_at = [end - back for end in ends for back in chance.sample(range(-4, 8), 4)] if seed > 0 else []
