@@ -37,6 +37,7 @@ from trirail.wire.packets import (
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME, ERROR
+from trirail_drivers.cia402.canopen_frames import SYNC
 from trirail_drivers.simulated import SimulatedDrive
 
 REFUSED = re.compile("no setpoint|setpoint refused")
@@ -149,6 +150,7 @@ MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
         CAN_FRAME.pack(0x281 + chance.randrange(3), 3, struct.pack("<i", 5))
     ),
     "a fault": lambda session, chance: session.drives.faults.add(f"{chance.choice('ABC')} fault 2310"),
+    "a following error": lambda session, chance: session.drives.faults.carriages.push(chance.randrange(3), 0.05),
     "silence": lambda session, chance: session.drives.faults.add(f"{chance.choice('ABC')} silent for 0.004"),
     "late frames": lambda session, _: setattr(session, "holds", True),
     "a full bus": lambda session, chance: setattr(session, "room", chance.randrange(4)),
@@ -198,6 +200,8 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
     assert not [each.event.message for each in events if REFUSED.search(each.event.message)]
     differs = replayed(config, records, inputs)
     assert not differs.any(), (int(np.argmax(differs)) + 1, mishap)
+    syncs = sum(CAN_FRAME.unpack(packet)[0] == SYNC for packet in session.sent)
+    assert mishap == "a full bus" or syncs == len(records), "each cycle sends one SYNC and has one record"
     for cycle in began:
         modes = [MODES[each] for each in records["mode"][cycle : cycle + 3]]
         if mishap.startswith("a quick stop"):
@@ -278,6 +282,9 @@ def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
     assert len(pressed) > 5
     assert ["switched on" in message for _, message in reported] == [on for _, on in pressed]
     assert all(0 <= at - cycle <= 1 + number for (at, _), (cycle, _) in zip(reported, pressed, strict=True))
+    changes_at = np.flatnonzero(np.diff(records["inputs"][:, 1], prepend=0))
+    places = [f"at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm" for x, y, _ in records["pose"][changes_at].tolist()]
+    assert all(place in message for (_, message), place in zip(reported, places, strict=True))
     assert any("done: input part" in each.event.message for each in events)
     differs = replayed(config, records, inputs)
     assert not differs.any(), int(np.argmax(differs)) + 1
