@@ -32,6 +32,7 @@ AGAIN = coded("again", EventCode.RECORDED_AGAIN)
 
 LINES: list[tuple[GivenInput, str]] = [
     (DecidedAhead(2), '{"type":"DecidedAhead","cycles":2}'),
+    (DecidedAhead(1, again=True), '{"type":"DecidedAhead","cycles":1,"again":true}'),
     (
         Announcement(
             Notice("refused", "warning", "no", user="ann", code=RefusalCode.BUSY, event_code=EventCode.REFUSED)

@@ -178,14 +178,13 @@ def _run_cycle(
 ) -> None:
     """Decide as the loop did before a cycle, and run the same steps that the loop ran after the SYNC of the cycle."""
     inputs = [entry for entry in entries if not isinstance(entry.given, DrivesFault)]
-    decided = [entry for entry in inputs if not entry.urgent]
     if isinstance(drives, _RecordedDrives):
         for entry in entries:
             if isinstance(entry.given, DrivesFault):
                 drives.set_fault(entry.given)
-    # The loop handled inputs that arrived while it waited for its tick separately, after the other inputs.
+    # Earlier versions handled inputs that arrived while the loop waited for its tick separately, after the others.
     for waiting in (False, True) if not ahead.under_way else ():
-        batch = _batch([entry for entry in decided if entry.waiting is waiting], planner)
+        batch = _batch([entry for entry in inputs if not entry.urgent and entry.waiting is waiting], planner)
         if batch or not (waiting or ahead.decided):
             control.decide(batch)
     for entry in inputs:
@@ -231,7 +230,7 @@ class _Ahead:
 
     def begin_cycle(self) -> None:
         """Decide before the present cycle if a fault in this cycle ended the cycles beside the decision."""
-        inputs, cycle = self._inputs(), self._control.modes.cycle
+        inputs, cycle = self._inputs(self._last + 1), self._control.modes.cycle
         if not self.under_way or len(inputs) == len(self._pending):
             return
         after = self._pending[len(inputs)]
@@ -241,29 +240,39 @@ class _Ahead:
 
     def end_cycle(self) -> None:
         """Evaluate the present cycle, or leave this to the decision beside which the cycle ran."""
-        control, pending = self._control, self._pending
-        cycle, self.decided = control.modes.cycle, False
-        if not self.under_way and pending and pending[0].cycle == cycle + 1:
-            content = pending[0].given
-            if isinstance(content, DecidedAhead):
-                pending.popleft()
-                self._last, self._known = cycle + content.cycles, control.measured.snapshot()
-                control.ahead = content.cycles
-        if not self.under_way:
-            control.conclude()
-        elif cycle < self._last:
-            control.modes.cycle += 1
-        else:
+        control, cycle, self.decided = self._control, self._control.modes.cycle, False
+        if self.under_way and cycle == self._last:
             self._decide()
             control.end_ahead()
+        if self.under_way:
+            control.modes.cycle += 1
+        elif (ahead := self._next_ahead(cycle)) is None:
+            if not self.decided:
+                control.conclude()
+        else:
+            if not self.decided and ahead.again:
+                control.conclude()
+                control.decide(_batch(self._popped(cycle + 1), self._planner))
+            elif not self.decided:
+                control.modes.cycle += 1
+            self._pending.popleft()
+            self._last, self._known = cycle + ahead.cycles, control.measured.snapshot()
+            control.ahead = ahead.cycles
+
+    def _next_ahead(self, cycle: int) -> DecidedAhead | None:
+        """Return the note of a decision that was made beside the cycles after cycle `cycle`; None if there is none."""
+        number = len(self._inputs(cycle + 1))
+        following = self._pending[number] if number < len(self._pending) else None
+        if following is None or following.cycle != cycle + 1 or not isinstance(following.given, DecidedAhead):
+            return None
+        return following.given
 
     def _decide(self) -> None:
         """Decide with the feedback from before the cycles beside the decision."""
         assert self._known is not None
         with self._control.measured.as_of(self._known):
             self._control.conclude()
-            inputs = [self._pending.popleft() for _ in self._inputs()]
-            self._control.decide(_batch(inputs, self._planner))
+            self._control.decide(_batch(self._popped(self._last + 1), self._planner))
         self._known, self._control.ahead, self.decided = None, 0, True
 
     def _decide_in_vain(self, cycle: int) -> None:
@@ -279,13 +288,18 @@ class _Ahead:
             array[:] = copy
         control.return_to(cycle - 1)
 
-    def _inputs(self) -> list[ControlInput]:
-        """Return the pending inputs that the decision took into account."""
-        return list(itertools.takewhile(self._belongs, self._pending))
+    def _popped(self, cycle: int) -> list[ControlInput]:
+        """Remove and return the inputs that a decision before cycle `cycle` took into account."""
+        return [self._pending.popleft() for _ in self._inputs(cycle)]
 
-    def _belongs(self, entry: ControlInput) -> bool:
-        later = entry.urgent or entry.waiting or isinstance(entry.given, DrivesFault | DecidedAhead)
-        return entry.cycle == self._last + 1 and not later
+    def _inputs(self, cycle: int) -> list[ControlInput]:
+        """Return the next inputs, as far as a decision before cycle `cycle` took them into account."""
+
+        def belongs(entry: ControlInput) -> bool:
+            later = entry.urgent or entry.waiting or isinstance(entry.given, DrivesFault | DecidedAhead)
+            return entry.cycle == cycle and not later
+
+        return list(itertools.takewhile(belongs, self._pending))
 
 
 def _due_inputs(pending: deque[ControlInput], cycle: int) -> Iterator[ControlInput]:

@@ -69,30 +69,26 @@ def called(pollfds: NDArray[np.int32]) -> bool:
     return bool(_poll(pollfds.ctypes.data, np.uint64(len(pollfds)), 0) != 0)
 
 
-@compiled(b1(i8, i8, POLLFDS, i8[::1]), releases=True)
-def wait(deadline_ns: int, spare_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
-    """Wait for the deadline, or until a neighbour calls. Return True if a neighbour has called.
+@compiled(b1(i8, POLLFDS, i8[::1]))
+def wait_for_call(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
+    """Wait until a neighbour calls, but not longer than until the deadline. Return True if a neighbour has called.
 
     Parameters
     ----------
     deadline_ns : int
         Time of the monotonic clock [ns].
-    spare_ns : int
-        Time before the deadline in which calls are ignored [ns].
     pollfds : (n, 2)
         Sockets of the neighbours, as for `called`.
     moment : (2,)
         Memory for a struct timespec.
 
     """
-    # There are two separate waits, because ppoll wakes up later after its time-out than clock_nanosleep.
-    left = deadline_ns - spare_ns - now_ns(moment)
+    left = deadline_ns - now_ns(moment)
     while left > 0:
         moment[0], moment[1] = left // _SECOND, left % _SECOND
         if _ppoll(pollfds.ctypes.data, np.uint64(len(pollfds)), moment.ctypes.data, 0) > 0:
             return True
-        left = deadline_ns - spare_ns - now_ns(moment)
-    sleep(deadline_ns, moment)
+        left = deadline_ns - now_ns(moment)
     return False
 
 
@@ -103,25 +99,11 @@ class PollSet:
         self._ports = ports
         self.pollfds = np.zeros((len(ports), 2), np.int32)
         """Array of struct pollfd."""
-        self._moment = np.zeros(2, np.int64)
 
     def refresh(self) -> None:
         """Update the array with the descriptors of the present connections."""
         for pollfd, port in zip(self.pollfds, self._ports, strict=True):
             pollfd[:] = port.fileno(), _POLLIN
-
-    def called(self) -> bool:
-        """Return True if a neighbour has called."""
-        self.refresh()
-        return bool(called(self.pollfds))
-
-    def wait(self, deadline_ns: int, spare_ns: int) -> bool:
-        """Wait for the deadline, or until a neighbour calls. Return True if a neighbour has called.
-
-        A call less than `spare_ns` before the deadline is ignored; see the module's function `wait`.
-        """
-        self.refresh()
-        return bool(wait(deadline_ns, spare_ns, self.pollfds, self._moment))
 
 
 class Tick(NamedTuple):
@@ -191,13 +173,6 @@ class Ticker:
             return -1
         self._sleep_to_next()
         return self._now()
-
-    def listen(self, poll_set: PollSet, spare_ns: int) -> bool:
-        """Wait for the next deadline or for a call at least `spare_ns` before it. Return True if there is a call."""
-        if self._now is time.monotonic_ns:
-            return poll_set.wait(self.deadline_ns + self._period_ns - self._busy_wait_ns, spare_ns)
-        self._sleep_to_next()
-        return poll_set.called()
 
     def wait(self) -> Tick:
         """Sleep until the next deadline and return its tick. Skip ticks that were missed by a whole period or more."""

@@ -30,26 +30,14 @@ from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import Mode
 
 DECISION_BUDGET_NS = 300_000
-"""Shortest time that must be left before the next tick to handle requests [ns].
-
-If less time is left, the requests wait until the setpoints of the next cycle have been sent.
-"""
-REPORT_BUDGET_NS = 150_000
-"""Shortest time that must be left before the next tick to send events and answers, or a batch of records [ns]."""
-CALL_BUDGET_NS = 500_000
-"""Shortest time that must be left before the next tick to serve a call during the wait for it [ns].
-
-If less time is left, the next cycle serves the call.
-"""
-LONGEST_CALL = 0.9
-"""Limit of that time, as a fraction of the period, above which it would never be measured again."""
+"""Shortest time for which a decision beside the cycles is expected to take [ns]."""
 HANDOVER_NS = 300_000
 """Time for taking over the result of a decision beside the cycles, and for preparing the next motion [ns].
 
 A decision follows many cycles of compiled code, so that the caches of the processor no longer hold Python's code.
 """
 BUDGET_DECAY = 1 / 32
-"""Fraction by which a budget shrinks each time the work takes less time than the budget."""
+"""Fraction by which the budget shrinks each time a decision takes less time than the budget."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
 """Minimum time-out for the gateway's heartbeat, in cycles."""
 MAX_SHUTDOWN_S = 3.0
@@ -60,9 +48,9 @@ After this time the loop ends, and the drives stop by themselves.
 
 
 class TimeBudget:
-    """Time that a kind of work needs before the next tick, which is longer on a slower machine.
+    """Time that a decision needs, which is longer on a slower machine.
 
-    It is the longest recent duration of the work, within limits [ns].
+    It is the longest recent duration of a decision, within limits [ns].
     """
 
     def __init__(self, shortest_ns: int, longest_ns: int) -> None:
@@ -71,7 +59,7 @@ class TimeBudget:
         self.ns = shortest_ns
 
     def note(self, duration_ns: int) -> None:
-        """Take a duration of the work into account."""
+        """Take a duration into account."""
         shrunk_ns = round(self.ns * (1 - BUDGET_DECAY))
         self.ns = min(max(self._shortest_ns, shrunk_ns, duration_ns), self._longest_ns)
 
@@ -100,7 +88,7 @@ class Loop:
         quiet
             True if the compiled call runs the cycles without events, False if Python runs every cycle.
         now
-            Clock from which the time left before the next tick is calculated [ns].
+            Clock with which the duration of decisions is measured [ns].
 
         """
         self._now = now
@@ -120,22 +108,15 @@ class Loop:
         self._overruns = Overruns(config.watchdogs.max_overruns)
         self._heart = heartbeats.heart("loop")
         self._urgent_flag = UrgentFlag(heartbeats)
-        self._decision_budget = TimeBudget(DECISION_BUDGET_NS, self._period_ns)
-        self._report_budget = TimeBudget(REPORT_BUDGET_NS, self._period_ns)
-        self._flush_budget = TimeBudget(REPORT_BUDGET_NS, self._period_ns)
-        self._poll_set = PollSet(ports)
-        self._call_budget = TimeBudget(CALL_BUDGET_NS, round(LONGEST_CALL * self._period_ns))
-        self._listened = self._never_listens
-        """True if no further call is served before the next tick."""
-        self._reports_postponed = False
-        """True if events and answers have not been sent yet, because too little time was left before a tick."""
         self._work: Callable[[], None] | None = None
         """Work that is due beside the next cycles."""
-        self._beside_budget = TimeBudget(DECISION_BUDGET_NS, MOST_AHEAD * self._period_ns)
+        self._decision_budget = TimeBudget(DECISION_BUDGET_NS, MOST_AHEAD * self._period_ns)
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
-            beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
+            beside = self._reports, heartbeats, ports.gateway, PollSet(ports), watch, self._urgent_flag
             self._quiet = QuietCycles(self.control, drives, *beside, config.loop.busy_wait_ns, self._decide_ahead)
+        self._decided_after = 0
+        """Cycle after which the newest decision has taken effect."""
         self._fault: DriveFault | None = None
         self._unready: tuple[str, ...] = ()
         self._marked_ns = 0
@@ -162,26 +143,18 @@ class Loop:
         return self._quiet.cycles if self._quiet is not None else 0
 
     def turn(self, ticker: Ticker) -> None:
-        """Run cycles without events in compiled code, or one cycle with an event in Python; then handle requests.
-
-        If a neighbour calls during the wait for a tick, only serve that call. At most one such call is served before
-        each tick.
-        """
+        """Run cycles without events in compiled code, or one cycle with an event in Python; then handle requests."""
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._gateway.frozen or not self._planner.idle
         if quiet is not None and not disturbed:
-            spare_ns, once = self._call_budget.ns, self._postponed
             work, self._work = self._work, None
-            budget_ns, listens = self._beside_budget.ns + HANDOVER_NS, not self._listened
-            newest = quiet.run(ticker, self._overruns, spare_ns, budget_ns, work, listens=listens, once=once)
+            newest = quiet.run(ticker, self._overruns, self._decision_budget.ns + HANDOVER_NS, work)
         elif quiet is not None:
             quiet.leave()
-        if newest is None and self._work is not None:
-            self._work()
-            self._work = None
-        if newest is None and not self._listened and ticker.listen(self._poll_set, self._call_budget.ns):
-            self._serve_call(ticker)
-        elif newest is None:
+        if newest is None:
+            if self._work is not None:
+                self._work()
+                self._work = None
             self.cycle(ticker.wait())
         elif quiet is not None and newest.ahead is not None:
             self._finish_ahead(quiet, ticker, newest, newest.ahead)
@@ -192,23 +165,21 @@ class Loop:
             self._continue_after_sync(newest.tick)
         elif newest.reached in (Reached.OBSERVED, Reached.SOLVED):
             self._continue_solved(newest)
-        elif newest.reached is Reached.CALLED:
-            self._serve_call(ticker)
         elif quiet is not None:
-            self._listened = self._never_listens
             self._follow_up(quiet, newest)
 
     def _follow_up(self, quiet: QuietCycles, newest: QuietResult) -> None:
         """Decide before the next tick, if that is due after a complete cycle."""
         next_ns = newest.deadline_ns + self._period_ns
-        decides = newest.called or newest.decides or self._inputs_postponed or self._reports.misses_recorder
+        decides = newest.called or newest.decides or self._reports.misses_recorder
         if decides:
             began_ns = self._now()
             quiet.conclude(newest)
             self._decide(next_ns, called=newest.called, due=newest.decides)
-            self._beside_budget.note(self._now() - began_ns)
+            self._decided_after = newest.cycle
+            self._decision_budget.note(self._now() - began_ns)
             quiet.add(Part.DECIDE)
-        self._send_beside(reports=decides or self._reports_postponed)
+        self._send_beside(reports=decides)
 
     def _send_beside(self, *, reports: bool) -> None:
         """Send the batch of records, if it is due, and events and answers beside the next cycles."""
@@ -227,19 +198,19 @@ class Loop:
         next_ns = request.deadline_ns + (number + 1) * self._period_ns
         control.resume(request.cycle, request.time, None)
         control.modes.hold_commands()
-        self._reports.note(next_ns, DecidedAhead(number))
+        self._reports.note(next_ns, DecidedAhead(number, again=self._decided_after == request.cycle))
         control.foresee(number)
         if request.called:
             self._read()
         self._pass_to_control(self._noted(next_ns))
-        self._beside_budget.note(self._now() - request.requested_ns)
+        self._decision_budget.note(self._now() - request.requested_ns)
 
     def _finish_ahead(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
         """Let a decision take effect that was made beside the newest cycles, after cycle `last`."""
-        self._listened = self._never_listens
         self._finish_beside(quiet, ticker, newest, last)
         self.control.modes.send_commands()
         self.control.end_ahead()
+        self._decided_after = self.control.cycles
         self._send_beside(reports=True)
 
     def _finish_beside(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
@@ -326,7 +297,6 @@ class Loop:
 
     def _end(self, tick: Tick) -> None:
         """Record a cycle after its setpoints have been sent, then handle its results and the waiting requests."""
-        self._listened = self._never_listens
         next_ns = tick.deadline_ns + self._period_ns
         self._drives.next_sync = next_ns * 1e-9
         self._reports.record(tick, self._overruns.all, self._parts_ns)
@@ -334,7 +304,10 @@ class Loop:
         self._reports.pass_on()
         self.control.conclude()
         self._decide(next_ns)
-        self._send_before(next_ns)
+        self._decided_after = self.control.cycles
+        self._send_reports()
+        if not self._reports.due_after:
+            self._flush()
         self._mark(Part.DECIDE)
 
     def _handle_urgent(self, inputs: Iterable[Request | Disturbance], now_ns: int) -> None:
@@ -343,24 +316,8 @@ class Loop:
             self._reports.note(now_ns, each, urgent=True)
             self.control.handle(each, now_ns)
 
-    @property
-    def _postponed(self) -> bool:
-        """True if requests or reports wait because too little time was left before a tick."""
-        return self._reports_postponed or self._inputs_postponed
-
-    @property
-    def _never_listens(self) -> bool:
-        """True if a call takes longer than a period, so that none is served before a tick."""
-        return self._call_budget.ns >= self._period_ns
-
-    @property
-    def _inputs_postponed(self) -> bool:
-        return self._gateway.postponed or self._planner.postponed
-
     def _decide(self, next_ns: int, *, called: bool = True, due: bool = True) -> None:
-        """Handle requests and send reports before the next tick.
-
-        If too little time is left, the work is postponed once, until the setpoints of the next cycle have been sent.
+        """Handle requests before the next tick.
 
         Parameters
         ----------
@@ -372,34 +329,12 @@ class Loop:
             Whether the control must decide, even if nothing has been received.
 
         """
-        waited = self._inputs_postponed
         self._drives.next_sync = next_ns * 1e-9
         if called:
             self._read()
-        began_ns = self._now()
-        in_time = waited or next_ns - began_ns >= self._decision_budget.ns
-        if due or (in_time and self._inputs_postponed):
-            self._pass_to_control(self._noted(next_ns) if in_time else ())
-            if in_time:
-                self._decision_budget.note(self._now() - began_ns)
-
-    def _send_before(self, next_ns: int) -> None:
-        """Send events and answers, and the batch of records if it is due, before the next tick.
-
-        If too little time is left, that is postponed once, until the setpoints of the next cycle have been sent.
-        """
-        began_ns = self._now()
-        if self._reports_postponed or next_ns - began_ns >= self._report_budget.ns:
-            self._send_reports()
-            self._report_budget.note(self._now() - began_ns)
-        else:
-            self._reports_postponed = True
-            self._reports.postpone()
-        if not self._reports.due_after:
-            began_ns = self._now()
-            if self._reports.full or next_ns - began_ns >= self._flush_budget.ns:
-                self._flush()
-                self._flush_budget.note(self._now() - began_ns)
+        inputs = list(self._noted(next_ns))
+        if due or inputs:
+            self._pass_to_control(inputs)
 
     def _pass_to_control(self, inputs: Iterable[TimedInput]) -> None:
         self.control.decide(inputs)
@@ -408,30 +343,18 @@ class Loop:
 
     def _send_reports(self) -> None:
         """Send events and answers, and receive the recorder's messages."""
-        self._reports_postponed = False
         self._reports.listen()
         self._reports.pass_on()
-
-    def _serve_call(self, ticker: Ticker) -> None:
-        """Handle requests that arrived during the wait for the next tick, so that they take effect at that tick."""
-        self._listened = True
-        began_ns, next_ns = self._now(), ticker.deadline_ns + self._period_ns
-        self._drives.next_sync = next_ns * 1e-9
-        self._read()
-        if inputs := list(self._noted(next_ns, waiting=True)):
-            self._pass_to_control(inputs)
-        self._send_reports()
-        self._call_budget.note(self._now() - began_ns)
 
     def _read(self) -> None:
         """Read the neighbours' packets, without any effect on the control."""
         self._gateway.read()
         self._planner.read(self.control.prepare)
 
-    def _noted(self, now_ns: int, *, waiting: bool = False) -> Iterator[TimedInput]:
+    def _noted(self, now_ns: int) -> Iterator[TimedInput]:
         """Yield the requests and the planner's answers, each with the time `now_ns`, and note each for the recorder."""
         for what in itertools.chain(self._gateway.requests(), self._planner.answers()):
-            self._reports.note(now_ns, what, waiting=waiting)
+            self._reports.note(now_ns, what)
             yield what, now_ns
 
     def _mark(self, part: Part) -> None:
@@ -475,4 +398,3 @@ class Loop:
         self._heart.beat()
         self._planner.accept()
         self._reports.flush()
-        self._call_budget.note(0)  # calls that are no longer served are not measured either

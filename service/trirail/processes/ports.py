@@ -50,11 +50,6 @@ class GatewayLink:
         """True if the gateway has disconnected, but no attempt to receive or send has noticed that yet."""
         return self._port.ended
 
-    @property
-    def postponed(self) -> bool:
-        """True if requests have been read but not handled."""
-        return bool(self._in_hand)
-
     def read(self, limit: int = REQUESTS_A_CYCLE) -> None:
         """Read at most `limit` requests, by default as many as can be handled in one cycle.
 
@@ -109,11 +104,6 @@ class PlannerLink:
         self._awaited: int | None = None
         self._unsent: str | None = None
         self._in_hand: list[PlanAnswer | PlannerLost] = []
-
-    @property
-    def postponed(self) -> bool:
-        """True if answers have been read but not handled."""
-        return bool(self._in_hand)
 
     @property
     def idle(self) -> bool:

@@ -5,11 +5,11 @@ for the tick. It sends the SYNC, receives frames and calls `observe`. It then ca
 applies the last gate to the setpoints, and writes setpoints and record. The call makes no decisions. Some decisions
 must be made before the setpoints are sent: if a drive sends anything other than its position, a request is urgent, a
 neighbour has disconnected, or the last gate refuses a setpoint. In these cases the call returns at the stage that it
-has reached, and Python continues from there. If other work is due, the call returns after the setpoints have been sent.
+has reached, and Python continues from there.
 
-If a decision would take longer than the time before the next tick, the call does not return: the thread beside it
-(trirail.processes.companion) decides while the call runs one or two further cycles. Other neighbours and other
-decisions then wait.
+If other work is due, or a neighbour calls, the thread beside the call (trirail.processes.companion) decides while the
+call runs one or two further cycles, and then returns. Other neighbours and other decisions wait. If the robot is not
+enabled, or an output may switch in these cycles, the call returns instead, and Python decides before the next tick.
 
 A signal does not end a wait. Python's signal handlers run when the call has returned, which is at the end of a batch of
 records at the latest.
@@ -29,7 +29,7 @@ from trirail.control import cycle, outputs
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.motion.paths import law_at
-from trirail.processes.clock import POLLFDS, busy_wait, called, now_ns, sleep, wait
+from trirail.processes.clock import POLLFDS, busy_wait, called, now_ns, sleep, wait_for_call
 from trirail.processes.cycle_frames import (
     AXES,
     EXPECTATIONS,
@@ -74,8 +74,6 @@ class Reached(IntEnum):
     """The cycle is complete, except for setpoints or outputs that the bus has not accepted."""
     DONE = 5
     """The cycle is complete."""
-    CALLED = 6
-    """The cycle is complete, and a neighbour has called during the wait for the next tick."""
 
 
 NO_CYCLE: Final = 1 << 62
@@ -195,15 +193,19 @@ def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
 
 
 @compiled()
-def _wait(state: NDArray[np.void], moment: NDArray[np.int64], pollfds: NDArray[np.int32]) -> bool:
-    """Wait until shortly before the deadline. Return True if a neighbour has called and must be served before it."""
-    if state[0].injected_ns >= 0:
-        return bool(state[0].listens and called(pollfds))
-    wake_ns = state[0].deadline_ns - state[0].busy_wait_ns
-    if state[0].listens:
-        return bool(wait(wake_ns, state[0].spare_ns, pollfds, moment))
-    sleep(wake_ns, moment)
-    return False
+def _is_called(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours) -> bool:
+    """Wait for a call until shortly before the next tick, unless a decision is due; return True if there is one.
+
+    A call with an urgent request waits for Python in the next cycle.
+    """
+    s = state[0]
+    if neighbours.hearts[URGENT_INDEX] != s.urgent_seen:
+        return False
+    if s.decides or s.injected_ns >= 0:
+        has_called = called(neighbours.pollfds)
+    else:
+        has_called = wait_for_call(s.deadline_ns + s.period_ns - s.busy_wait_ns, neighbours.pollfds, moment)
+    return bool(has_called and neighbours.hearts[URGENT_INDEX] == s.urgent_seen)
 
 
 @compiled()
@@ -234,11 +236,8 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
     """Wait for the tick, and send the frames at the start of a cycle. Return CONTINUE, or the reached stage."""
     s, times = state[0], frames.times
     s.deadline_ns += s.period_ns
-    if _wait(state, moment, neighbours.pollfds):
-        s.deadline_ns -= s.period_ns
-        s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
-        return Reached.CALLED
-    s.listens = s.period_ns > s.spare_ns and not s.beside
+    if s.injected_ns < 0:
+        sleep(s.deadline_ns - s.busy_wait_ns, moment)
     s.sent, s.called, s.decides = 0, called(neighbours.pollfds), False
     # The frames that have arrived answer the previous SYNC. Nothing is left to do between the deadline and SYNC.
     if not _receive(s, moment, frames, _now_ns(state, moment) / 1e9):
@@ -297,6 +296,20 @@ def _read(
     return CONTINUE
 
 
+@compiled()
+def _next_end(s: Any, motion: MotionArrays, newest: int, code: int) -> int:
+    """Return the cycle at most `most` cycles after `newest` in which the motion reaches the end of its goal.
+
+    Return NO_CYCLE if there is none. `code` is the result of trirail.control.cycle.command in the newest cycle.
+    """
+    time = s.time
+    for ahead in range(1, s.most + 1 if s.source == COMMAND else 1):
+        time += s.period
+        if cycle.ends_at(motion.knots, motion.law_knots, motion.law_pieces, time, s.target, s.course[1]) != code:
+            return newest + ahead
+    return NO_CYCLE
+
+
 @compiled(i8(_STATE, i8[::1], _FRAME_TABLES, _ROBOT, _MOTION))
 def solve(
     state: NDArray[np.void], moment: NDArray[np.int64], frames: FrameTables, robot: RobotArrays, motion: MotionArrays
@@ -339,12 +352,7 @@ def solve(
         )
     monitored = robot.monitored[0]
     in_position = s.settles and (monitored.inside >= monitored.dwell or s.cycle + 1 >= s.timeout)
-    s.ends, time = s.cycle + 1 if code != s.code else NO_CYCLE, s.time
-    for ahead in range(1, s.most + 1 if s.source == COMMAND else 1):
-        time += s.period
-        path_end = cycle.ends_at(motion.knots, motion.law_knots, motion.law_pieces, time, s.target, s.course[1])
-        if path_end != code and s.ends == NO_CYCLE:
-            s.ends = s.cycle + 1 + ahead
+    s.ends = s.cycle + 1 if code != s.code else _next_end(s, motion, s.cycle + 1, code)
     s.decides, s.code = in_position or s.cycle + 1 >= min(s.due, s.ends) - s.lead, code
     late = _now_ns(state, moment) / 1e9 - s.synced > s.period
     if code >> 2 != 0 or late or not set_frames(frames.setpoints, frames.axes, robot.sliders[0]):
@@ -436,11 +444,20 @@ def _cycles_beside(
 
 @compiled()
 def _request_decision(
-    state: NDArray[np.void], moment: NDArray[np.int64], number: int, copies: NDArray[np.int64]
-) -> None:
-    """Let Python decide beside the next cycles, with the present state of the robot."""
-    s = state[0]
-    s.beside, s.listens, s.until = True, False, s.cycle + number
+    state: NDArray[np.void],
+    moment: NDArray[np.int64],
+    motion: MotionArrays,
+    tables: OutputArrays,
+    copies: NDArray[np.int64],
+) -> bool:
+    """Let Python decide beside the next cycles, with the present state of the robot.
+
+    Return False, and change nothing, if it must decide before the next cycle.
+    """
+    s, number = state[0], _cycles_beside(state, moment, motion, tables)
+    if number == 0:
+        return False
+    s.beside, s.until = True, s.cycle + number
     s.requested, s.requested_deadline_ns, s.requested_called, s.requested_time = (
         s.cycle,
         s.deadline_ns,
@@ -452,6 +469,39 @@ def _request_decision(
     if s.injected_ns < 0:
         moment[0] = 1
         _write(s.doorbell, moment.ctypes.data, np.uint64(8))
+    return True
+
+
+@compiled()
+def _run_cycle(
+    state: NDArray[np.void],
+    moment: NDArray[np.int64],
+    neighbours: Neighbours,
+    frames: FrameTables,
+    robot: RobotArrays,
+    motion: MotionArrays,
+    tables: OutputArrays,
+) -> int:
+    """Run one cycle. Return CONTINUE, or the stage that it has reached if Python must go on."""
+    s = state[0]
+    reached = _begin(state, moment, neighbours, frames)
+    if reached == CONTINUE:
+        reached = _read(state, moment, neighbours, frames, robot.feedback)
+    if reached == CONTINUE:
+        reached = solve(state, moment, frames, robot, motion)
+    if reached != CONTINUE:
+        return reached
+    if not _switch_outputs(s, frames.axes, robot.record, motion, tables):
+        return Reached.SOLVED
+    _mark(state, moment, Part.KINEMATICS)
+    s.sent = send_frames(frames.bus, frames.departures, frames.setpoints, frames.times)
+    accepted = s.sent == len(frames.departures) and send_outputs(
+        frames.bus, frames.switchings, frames.pins, frames.axes, frames.times
+    )
+    _mark(state, moment, Part.WRITE)
+    record(state, robot, neighbours.batch)
+    _mark(state, moment, Part.RECORD)
+    return CONTINUE if accepted else Reached.WRITTEN
 
 
 @compiled()
@@ -468,31 +518,19 @@ def _run_cycles(
     """Run cycles until Python is needed; return the stage that the newest cycle has reached."""
     s = state[0]
     while s.cycle < s.until and s.batched < len(neighbours.batch):
-        reached = _begin(state, moment, neighbours, frames)
-        if reached == CONTINUE:
-            reached = _read(state, moment, neighbours, frames, robot.feedback)
-        if reached == CONTINUE:
-            reached = solve(state, moment, frames, robot, motion)
+        if s.most > 0 and not s.beside:
+            s.decides = s.cycle >= min(s.due, s.ends) - s.lead
+            s.called = _is_called(state, moment, neighbours)
+            if s.called or s.decides:
+                requested = _request_decision(state, moment, motion, tables, copies)
+                if requested and s.injected_ns >= 0:
+                    return Reached.DONE
+        reached = _run_cycle(state, moment, neighbours, frames, robot, motion, tables)
         if reached != CONTINUE:
             return reached
-        if not _switch_outputs(s, frames.axes, robot.record, motion, tables):
-            return Reached.SOLVED
-        _mark(state, moment, Part.KINEMATICS)
-        s.sent = send_frames(frames.bus, frames.departures, frames.setpoints, frames.times)
-        accepted = s.sent == len(frames.departures) and send_outputs(
-            frames.bus, frames.switchings, frames.pins, frames.axes, frames.times
-        )
-        _mark(state, moment, Part.WRITE)
-        record(state, robot, neighbours.batch)
-        _mark(state, moment, Part.RECORD)
-        if not accepted:
-            return Reached.WRITTEN
         if (s.called or s.decides) and not s.beside:
-            number = _cycles_beside(state, moment, motion, tables)
-            if number == 0:
-                return Reached.DONE
-            _request_decision(state, moment, number, copies)
-            if s.injected_ns >= 0:
+            requested = _request_decision(state, moment, motion, tables, copies)
+            if not requested or s.injected_ns >= 0:
                 return Reached.DONE
     return Reached.DONE
 
@@ -526,6 +564,7 @@ def run(
     s = state[0]
     if not s.beside:
         copy_state(copies, False)
+        s.ends = _next_end(s, motion, s.cycle, s.code)
     reached = _run_cycles(state, moment, neighbours, frames, robot, motion, tables, copies)
     if not s.beside:
         copy_state(copies, True)

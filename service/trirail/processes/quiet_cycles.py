@@ -146,7 +146,7 @@ class QuietCycles:
         self._nothing = np.zeros(1)
         self._decide = decide
         self._companion = Companion(self._answer)
-        self.beside = 0, quiet.MOST_AHEAD
+        self.beside = 1, quiet.MOST_AHEAD
         """Minimum and maximum number of cycles that run beside a decision, which tests change."""
         measured, setpoints = control.measured, control.setpoints
         self._measured, self._commanded, self._furthest = _Copies(), _Copies(), _Copies()
@@ -170,12 +170,8 @@ class QuietCycles:
         self,
         ticker: Ticker,
         overruns: Overruns,
-        spare_ns: int,
         budget_ns: int,
         work: Callable[[], None] | None = None,
-        *,
-        listens: bool,
-        once: bool,
     ) -> QuietResult | None:
         """Run cycles until an event or the end of a batch, and return the result for the newest cycle.
 
@@ -184,27 +180,21 @@ class QuietCycles:
 
         Parameters
         ----------
-        spare_ns
-            Time before a tick in which calls are not served [ns].
         budget_ns
             Time that a decision beside the cycles needs [ns].
         work
             Work beside the cycles that changes neither the control nor the drives.
-        listens
-            True if a call during the wait for the first tick must be served before that tick.
-        once
-            True to run only one cycle, because messages wait to be sent after that cycle.
 
         """
         control, state = self._control, self._state
-        if not ((once or self._reports.idle) and self._gateway.no_peer_lost and self._tables_ready()):
+        if not (self._reports.idle and self._gateway.no_peer_lost and self._tables_ready()):
             self.leave()
             if work is not None:
                 work()
             return None
         state.injected_ns = ticker.sleep_if_injected()
-        state.until = control.cycles + (1 if once or state.injected_ns >= 0 else max(1, self._reports.due_after))
-        state.beside, state.listens, state.spare_ns, state.requested = False, listens, spare_ns, -1
+        state.until = control.cycles + (1 if state.injected_ns >= 0 else max(1, self._reports.due_after))
+        state.beside, state.requested = False, -1
         state.logged, state.report_due = control.outputs.logged, control.outputs.report_due
         state.budget_ns = budget_ns
         state.least, state.most = self.beside if self._runs_beside else (0, 0)
@@ -283,7 +273,7 @@ class QuietCycles:
     def leave_at(self, reached: Reached) -> None:
         """Return lent tables to the drives, if the newest cycle has reached a stage that needs Python."""
         state = self._state
-        if reached not in (Reached.DONE, Reached.CALLED):
+        if reached is not Reached.DONE:
             synced = state.synced if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
             self.leave(state.handled, state.arrived, synced=synced, error=max(state.error, 0))
 
@@ -385,7 +375,7 @@ class QuietCycles:
         state.source = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
         state.cycle, state.mode = self._control.cycles, MODES.index(self._control.state.mode)
         state.held, state.at_rest, state.code = steady.held, steady.at_rest, steady.code
-        state.due = int(min(max(steady.until, state.cycle), quiet.NO_CYCLE))
+        state.due = int(min(max(steady.until, state.cycle + 1), quiet.NO_CYCLE))
         state.settles, state.timeout = steady.settles_by is not None, steady.settles_by or 0
         runs = self._control.schedule.runs
         state.time = runs[0].time if runs else 0.0

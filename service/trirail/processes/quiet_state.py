@@ -59,10 +59,8 @@ class QuietState(ctypes.Structure):
     """Number of cycles before `due` or `ends` at which a decision beside these cycles is requested."""
     ends: int
     """Cycle in which the motion reaches the end of its goal, if that is at most `most` cycles away."""
-    spare_ns: int
-    """Time before a tick in which calls are not served [ns]."""
     called: bool
-    """Whether a neighbour has called before the newest cycle."""
+    """Whether a neighbour has called before the newest cycle or, at a request for a decision, before the next."""
     decides: bool
     """Whether a decision is due after the newest cycle."""
     mode: int
@@ -125,8 +123,6 @@ class QuietState(ctypes.Structure):
     """Value of `called` at the request."""
     requested_time: float
     """Value of `time` at the request."""
-    listens: bool
-    """Whether a call during the wait for the next tick is served immediately."""
     urgent_seen: Unsigned
     """Count of urgent requests at the last check."""
     gateway_seen: Unsigned

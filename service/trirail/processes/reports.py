@@ -37,8 +37,6 @@ from trirail.wire.vocabulary import MODES
 
 BATCHES_PER_SECOND = 50
 ANSWERS_A_CYCLE = 8
-SPARE_SHARE = 8
-"""A batch is due one part in SPARE_SHARE before it is full, so that it can wait while decisions leave no time."""
 PROGRESS_EVERY = 0.1
 """Minimum interval between two progress reports while drives are being configured [s]."""
 INPUTS_KEPT = 8
@@ -86,8 +84,6 @@ class Reports:
         self._sent_events = 0
         self._inputs = 0
         self._unsent_inputs: list[ControlInput] = []
-        self._postponed = 0, 0
-        """Number of waiting events that belong to an earlier cycle than later events, and the number of that cycle."""
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         """Number of records in a full batch. Cycles beside a decision may add MOST_AHEAD records."""
         self._made = control.measured.record.view(np.uint8).data
@@ -101,7 +97,7 @@ class Reports:
         self._recorded = False
         self._unrecorded = ""
 
-    def note(self, now_ns: int, content: GivenInput, *, urgent: bool = False, waiting: bool = False) -> None:
+    def note(self, now_ns: int, content: GivenInput, *, urgent: bool = False) -> None:
         """Store an input to the control until it is sent to the recorder.
 
         Parameters
@@ -110,14 +106,10 @@ class Reports:
             Time at which the control received the input [ns].
         urgent
             True if the input applies to the present cycle, False if it applies to the next cycle.
-        waiting
-            The same as in ControlInput.
 
         """
         self._inputs += 1
-        self._unsent_inputs.append(
-            ControlInput(self._inputs, self._control.modes.cycle, now_ns, content, urgent, waiting)
-        )
+        self._unsent_inputs.append(ControlInput(self._inputs, self._control.modes.cycle, now_ns, content, urgent))
 
     def record(self, tick: Tick, overruns: int, parts_ns: Sequence[int]) -> None:
         """Complete the record of the newest cycle, and append it to the batch."""
@@ -131,13 +123,8 @@ class Reports:
 
     @property
     def due_after(self) -> int:
-        """Number of cycles after which the batch is due to be sent; 0 if it is due now."""
-        return max(0, self._batch_size - self._batch_size // SPARE_SHARE - self.batched)
-
-    @property
-    def full(self) -> bool:
-        """True if the batch has no space for another record, and must be sent."""
-        return self.batched >= self._batch_size
+        """Number of cycles after which the batch is full and due to be sent; 0 if it is due now."""
+        return max(0, self._batch_size - self.batched)
 
     @property
     def idle(self) -> bool:
@@ -171,10 +158,6 @@ class Reports:
             self._publish()
         if self._answers:
             self._send_answers()
-
-    def postpone(self) -> None:
-        """Postpone events until after the next cycle. They are still reported with the number of the present cycle."""
-        self._postponed = len(self._control.ledger.notices), self._control.modes.cycle
 
     def flush(self) -> None:
         """Send the batch of records and captured frames, accept new peers, and send events that have not been sent."""
@@ -258,10 +241,9 @@ class Reports:
         """Send the inputs to the control, number and send the events, and enqueue the answers."""
         control, ledger = self._control, self._control.ledger
         self._send_inputs()
-        (postponed, earlier), self._postponed = self._postponed, (0, 0)
-        for number, notice in enumerate(ledger.notices):
+        cycle = control.modes.cycle
+        for notice in ledger.notices:
             self._events += 1
-            cycle = earlier if number < postponed else control.modes.cycle
             wall, offset = time.time(), time.time() - time.monotonic()
             packet = event_packet(notice.event(self._events, cycle * self._period, cycle, wall, offset))
             self._kept.append(packet)

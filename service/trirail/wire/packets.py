@@ -182,11 +182,13 @@ class DrivesFault(Struct, frozen=True, tag=True):
     """Names of the drives that cannot be reset yet."""
 
 
-class DecidedAhead(Struct, frozen=True, tag=True):
+class DecidedAhead(Struct, frozen=True, tag=True, omit_defaults=True):
     """Input of the control that it decides while the next cycles run, so that its decisions take effect after them."""
 
     cycles: int
     """Number of these cycles; 0 if a fault in the present cycle ends them."""
+    again: bool = False
+    """True if the control had already decided after the cycle before these."""
 
 
 class PlannerLost(Struct, frozen=True, tag=True):
@@ -214,7 +216,7 @@ class ControlInput(Struct, frozen=True, tag="Input"):  # recordings contain this
     urgent: bool = False
     """True if the input was handled after the cycle's SYNC, False if it was handled before the SYNC."""
     waiting: bool = False
-    """True if the input arrived while the loop waited for the cycle's tick, after it had handled the other inputs."""
+    """True if the input was handled after the other inputs, just before the cycle. Only old recordings have this."""
 
 
 class Unrecorded(Struct, frozen=True, tag=True):
