@@ -308,7 +308,7 @@ class QuietCycles:
 
     def record(self, overruns: Overruns) -> int:
         """Append the record of the newest cycle to the batch, and return the number of the cycle."""
-        state = self._state
+        state, self._robot.record["outputs"] = self._state, self._output_words  # a decision may have changed them
         state.overruns, state.batched = overruns.all, self._reports.batched
         number = int(quiet.record(self._tables[0], self._robot, self._reports.batch))
         self._reports.batched = state.batched
