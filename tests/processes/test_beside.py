@@ -14,7 +14,16 @@ import pytest
 from control_rig import carried
 from msgspec import structs
 from numpy.typing import NDArray
-from processes.test_quiet import CONFIGS, CYCLES, Happening, Session, requests_of_two, script, stops_first
+from processes.test_quiet import (
+    CONFIGS,
+    CYCLES,
+    Happening,
+    Session,
+    cycles_by_python,
+    requests_of_two,
+    script,
+    stops_first,
+)
 from processes.test_quiet_outputs import CYCLES as OUTPUT_CYCLES
 from processes.test_quiet_outputs import INPUTS, OUTPUTS, PINS, changes
 from processes.test_quiet_outputs import session as session_with_outputs
@@ -23,6 +32,7 @@ from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
+from trirail.wire import links
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.marks import StopAt
 from trirail.wire.packets import (
@@ -269,6 +279,106 @@ def test_a_stop_that_arrives_while_nothing_is_decided_takes_effect_in_its_cycle(
     assert MODES[records["mode"][at - 1]] is Mode.MOVING
     assert MODES[records["mode"][at]] in (Mode.STOPPING, Mode.FAULT)
     assert not replayed(CONFIGS["cia402"], records, inputs).any()
+
+
+def restart_gateway(session: Session) -> None:
+    """Close the gateway's end, and connect another."""
+    session.gateway.close()
+    session.gateway = links.connect(session.folder / "gateway")
+    session._stack.callback(session.gateway.close)
+
+
+RAMP_AT = 200
+"""Number of a turn in which a lower rate is asked for: decisions are due in each of the next cycles."""
+ALLOWED_LATE = CONFIGS["cia402"].watchdogs.max_overruns
+DUE: dict[str, Callable[[Session], None]] = {
+    "stop": lambda session: session.ask(CommandRequest(9, "ann", Command.STOP)),
+    "disable": lambda session: session.ask(CommandRequest(9, "ann", Command.DISABLE)),
+    "pause": lambda session: session.ask(CommandRequest(9, "ann", Command.PAUSE)),
+    "quick stop": lambda session: session.ask(CommandRequest(9, "ann", Command.QUICK_STOP)),
+    "the gateway dies": restart_gateway,
+    "a late tick": lambda session: setattr(session, "late_ns", round(1e9 * session.config.period * (ALLOWED_LATE + 2))),
+}
+
+
+def ramping(what: Callable[[Session], None], later: int) -> dict[int, list[Happening]]:
+    """A goal whose rate is lowered, and what happens some cycles later."""
+    rate = CommandRequest(3, "ann", Command.OVERRIDE, carried(Command.OVERRIDE, 0.2))
+    return {
+        30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+        150: [Happening(lambda session: session.ask(GoalRequest(2, "ann", "g", PoseGoal(0.08, 0.0, 0.0), 0)))],
+        RAMP_AT: [Happening(lambda session: session.ask(rate))],
+        RAMP_AT + later: [Happening(what)],
+    }
+
+
+@pytest.mark.parametrize("what", DUE)
+@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.generated(1, 2)
+def test_what_must_not_wait_does_not_although_a_decision_is_due_in_every_cycle(
+    seed: int, number: int, what: str, tmp_path: Path
+) -> None:
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    quiet_of(session).beside = 1, number
+    began: list[int] = []
+
+    def happens(session: Session) -> None:
+        began.append(session.loop.control.cycles)
+        DUE[what](session)
+
+    try:
+        records, inputs, _ = recorded(session, ramping(happens, random.Random(seed).randrange(3, 6)), 400)
+    finally:
+        session.close()
+    ahead = {each.cycle for each in inputs if isinstance(each.given, DecidedAhead)}
+    assert {began[0] - 1, began[0]} & ahead, "decisions are made in every cycle"
+    assert MODES[records["mode"][began[0] - 1]] is Mode.MOVING
+    allowed = 2 if what == "a late tick" else 0
+    assert any(MODES[each] is not Mode.MOVING for each in records["mode"][began[0] : began[0] + 1 + allowed])
+    assert not replayed(CONFIGS["cia402"], records, inputs).any()
+
+
+def test_a_frozen_gateway_is_noticed_although_decisions_are_made_in_every_cycle(tmp_path: Path) -> None:
+    stopped: list[int] = []
+    goal = GoalRequest(2, "ann", "g", PoseGoal(0.08, 0.0, 0.0, speed=0.05), 0)
+    for beside in (0, 0), (1, 1), (2, 2):
+        folder = tmp_path / str(beside[0])
+        folder.mkdir()
+        session = Session(CONFIGS["cia402"], folder, "unix", quiet=True)
+        quiet_of(session).beside = beside
+        happens = {
+            30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+            100: [Happening(lambda session: session.ask(goal))],
+            200: [Happening(lambda session: setattr(session, "beats", False))],
+        }
+        for at in range(201, 900):
+            refused = CommandRequest(1000 + at, "ann", Command.ENABLE)
+            happens[at] = [Happening(lambda session, refused=refused: session.ask(refused))]  # type: ignore[misc]
+        try:
+            _, _, events = recorded(session, happens, 900)
+        finally:
+            session.close()
+        stopped.append(next(each.event.cycle for each in events if "the gateway is frozen" in each.event.message))
+    assert max(stopped) - min(stopped) <= 3
+
+
+def test_stops_while_the_robot_brakes_leave_the_cycles_to_compiled_code(tmp_path: Path) -> None:
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    before: list[int] = []
+
+    def stop(session: Session) -> None:
+        before.append(cycles_by_python(session))
+        session.ask(CommandRequest(10 + len(before), "ann", Command.STOP))
+
+    happens = ramping(stop, 10)
+    for later in (14, 18, 22):
+        happens[RAMP_AT + later] = [Happening(stop)]
+    happens[RAMP_AT + 60] = [Happening(lambda session: before.append(cycles_by_python(session)))]
+    try:
+        recorded(session, happens, 400)
+    finally:
+        session.close()
+    assert before[-1] - before[0] <= 8, "two for each stop"
 
 
 @pytest.mark.parametrize("number", [1, 2])

@@ -86,6 +86,7 @@ class Session:
     def __init__(self, config: Config, folder: Path, carrier: str, *, quiet: bool) -> None:
         self.now_ns = self.begins_ns
         self.config = config
+        self.folder = folder
         self.late_ns = 0
         """By how much the next tick comes late."""
         self.room: int | None = None
@@ -229,7 +230,7 @@ def odrives() -> Config:
 
 
 def fast() -> Config:
-    """The same robot at the highest rate, where no cycle has time for all that a request brings; its bus carries it."""
+    """The same robot at the highest rate; its bus carries it."""
     can_bus, loop = structs.replace(CONFIG.can, bitrate=8_000_000), structs.replace(CONFIG.loop, rate_hz=4000)
     return structs.replace(CONFIG, can=can_bus, loop=loop)
 
@@ -438,8 +439,7 @@ def test_what_two_users_ask_for_is_answered_alike(protocol: str, seed: int, tmp_
 
 
 @pytest.mark.generated(0, 1, 2, 3)
-def test_what_there_is_no_time_for_waits_alike(seed: int, tmp_path: Path) -> None:
-    """At the highest rate a request is handled behind the next cycle, and its answer waits for one more."""
+def test_cycles_at_the_highest_rate_are_those_of_python(seed: int, tmp_path: Path) -> None:
     both_ways(fast(), tmp_path, lambda: script(seed), CYCLES)
 
 

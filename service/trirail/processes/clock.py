@@ -1,9 +1,8 @@
 """Ticks of the loop at a fixed rate, on absolute deadlines of the monotonic clock.
 
-A message that arrives while the loop waits for its next tick ends the wait early. A neighbour is a process that is
-connected to the loop. A neighbour calls when it sends a packet or disconnects. If a call arrives early enough before
-the deadline, the loop serves the call immediately instead of in the next cycle. The wait is compiled, and is used both
-by cycles in Python and by cycles in compiled code.
+A neighbour is a process that is connected to the loop. A neighbour calls when it sends a packet or disconnects.
+Compiled code notices a call during its wait for the next tick, and lets Python decide beside the next cycle. Cycles in
+Python read the neighbours' packets after each cycle.
 """
 
 from __future__ import annotations
@@ -127,15 +126,21 @@ class Overruns:
         self.in_a_row = 0
         """Number of consecutive missed ticks, up to the newest tick."""
 
+    def count(self, missed: int) -> None:
+        """Count the ticks that were missed before the present tick. Too many in a row are remembered for `too_many`."""
+        self.all += missed
+        self.in_a_row = self.in_a_row + missed if missed or self.in_a_row > self.allowed else 0
+
     def too_many(self, missed: int) -> int:
         """Count the ticks that were missed before the present tick.
 
         Return the number of consecutive missed ticks if it exceeds `allowed`, and start counting again; else return 0.
         """
-        self.all += missed
-        in_a_row = self.in_a_row + missed if missed else 0
-        self.in_a_row = in_a_row if in_a_row <= self.allowed else 0
-        return in_a_row if in_a_row > self.allowed else 0
+        self.count(missed)
+        if self.in_a_row <= self.allowed:
+            return 0
+        in_a_row, self.in_a_row = self.in_a_row, 0
+        return in_a_row
 
 
 def sleep_until(deadline_ns: int, busy_wait_ns: int = 0) -> None:
@@ -159,7 +164,6 @@ class Ticker:
     ) -> None:
         self._period_ns = period_ns
         self._now = now
-        self._busy_wait_ns = busy_wait_ns
         self._sleep = sleep or partial(sleep_until, busy_wait_ns=busy_wait_ns)
         self.deadline_ns = now()
         """Time at which the newest tick was due [ns]."""

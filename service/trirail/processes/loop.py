@@ -30,7 +30,7 @@ from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import Mode
 
 DECISION_BUDGET_NS = 300_000
-"""Shortest time for which a decision beside the cycles is expected to take [ns]."""
+"""Least time that is assumed for a decision beside the cycles [ns]."""
 HANDOVER_NS = 300_000
 """Time for taking over the result of a decision beside the cycles, and for preparing the next motion [ns].
 
@@ -176,7 +176,6 @@ class Loop:
             began_ns = self._now()
             quiet.conclude(newest)
             self._decide(next_ns, called=newest.called, due=newest.decides)
-            self._decided_after = newest.cycle
             self._decision_budget.note(self._now() - began_ns)
             quiet.add(Part.DECIDE)
         self._send_beside(reports=decides)
@@ -210,7 +209,6 @@ class Loop:
         self._finish_beside(quiet, ticker, newest, last)
         self.control.modes.send_commands()
         self.control.end_ahead()
-        self._decided_after = self.control.cycles
         self._send_beside(reports=True)
 
     def _finish_beside(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
@@ -241,7 +239,7 @@ class Loop:
                     self.control.execute(feedback, self._mark)
                     self._end(tick)
                     return
-                self._overruns.all += tick.missed
+                self._overruns.count(tick.missed)
                 before = self.control.measured.feedback
                 reached = quiet.solve(feedback._replace(warnings=()), tick)  # reported below, and only once
                 quiet.copy_measured_back()
@@ -304,7 +302,6 @@ class Loop:
         self._reports.pass_on()
         self.control.conclude()
         self._decide(next_ns)
-        self._decided_after = self.control.cycles
         self._send_reports()
         if not self._reports.due_after:
             self._flush()
@@ -338,6 +335,7 @@ class Loop:
 
     def _pass_to_control(self, inputs: Iterable[TimedInput]) -> None:
         self.control.decide(inputs)
+        self._decided_after = self.control.cycles
         if self._quiet is not None:
             self._quiet.decided = True
 

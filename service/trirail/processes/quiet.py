@@ -3,13 +3,14 @@
 In each cycle, the call wakes up shortly before the tick, receives the frames that answer the previous SYNC, and waits
 for the tick. It sends the SYNC, receives frames and calls `observe`. It then calls `command`, `hold` or `follow`,
 applies the last gate to the setpoints, and writes setpoints and record. The call makes no decisions. Some decisions
-must be made before the setpoints are sent: if a drive sends anything other than its position, a request is urgent, a
-neighbour has disconnected, or the last gate refuses a setpoint. In these cases the call returns at the stage that it
-has reached, and Python continues from there.
+must be made before the setpoints are sent: if a drive sends anything other than its position, a request is urgent, the
+gateway is lost, too many ticks were missed, or the last gate refuses a setpoint. In these cases the call returns at the
+stage that it has reached, and Python continues from there.
 
 If other work is due, or a neighbour calls, the thread beside the call (trirail.processes.companion) decides while the
-call runs one or two further cycles, and then returns. Other neighbours and other decisions wait. If the robot is not
-enabled, or an output may switch in these cycles, the call returns instead, and Python decides before the next tick.
+call runs one or two further cycles, and then returns. Other decisions wait, also that the gateway is lost or that too
+many ticks were missed. If the robot is not enabled, or an output may switch in these cycles, or Python exchanges the
+frames, the call returns instead, and Python decides before the next tick.
 
 A signal does not end a wait. Python's signal handlers run when the call has returned, which is at the end of a batch of
 records at the latest.
@@ -193,19 +194,20 @@ def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
 
 
 @compiled()
-def _is_called(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours) -> bool:
-    """Wait for a call until shortly before the next tick, unless a decision is due; return True if there is one.
-
-    A call with an urgent request waits for Python in the next cycle.
-    """
+def _await_call(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours) -> bool:
+    """Wait for a call until shortly before the next tick, unless a decision is due; return True if there is one."""
     s = state[0]
-    if neighbours.hearts[URGENT_INDEX] != s.urgent_seen:
-        return False
     if s.decides or s.injected_ns >= 0:
-        has_called = called(neighbours.pollfds)
-    else:
-        has_called = wait_for_call(s.deadline_ns + s.period_ns - s.busy_wait_ns, neighbours.pollfds, moment)
-    return bool(has_called and neighbours.hearts[URGENT_INDEX] == s.urgent_seen)
+        return bool(called(neighbours.pollfds))
+    return bool(wait_for_call(s.deadline_ns + s.period_ns - s.busy_wait_ns, neighbours.pollfds, moment))
+
+
+@compiled()
+def _needs_python(s: Any, neighbours: Neighbours) -> bool:
+    """Return True if the next cycle needs Python: for an urgent request, a lost gateway or too many missed ticks."""
+    if neighbours.hearts[URGENT_INDEX] != s.urgent_seen or s.in_a_row > s.allowed:
+        return True
+    return bool(neighbours.pollfds[0, 1] & _PEER_GONE != 0 or s.gateway_turns >= s.gateway_patience)
 
 
 @compiled()
@@ -246,7 +248,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
     s.lateness_ns = now - s.deadline_ns
     s.missed = max(0, s.lateness_ns // s.period_ns)
     t = now / 1e9
-    if (s.missed and s.in_a_row + s.missed > s.allowed and not s.beside) or t >= times[0].due:
+    if (s.in_a_row + s.missed > s.allowed and not s.beside) or t >= times[0].due:
         return Reached.WAITED
     s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
     s.synced, s.handled, s.arrived = t, 0, 0
@@ -287,7 +289,7 @@ def _read(
     _mark(state, moment, Part.READ)
 
     s.overruns += s.missed
-    s.in_a_row = s.in_a_row + s.missed if s.missed else 0
+    s.in_a_row = s.in_a_row + s.missed if s.missed or s.in_a_row > s.allowed else 0
     s.gateway_seen, s.gateway_turns = count, turns
     for i in range(3):
         feedback[0].position[i] = axes[i].position
@@ -427,7 +429,11 @@ def _may_switch(s: Any, motion: MotionArrays, tables: OutputArrays) -> bool:
 
 @compiled()
 def _cycles_beside(
-    state: NDArray[np.void], moment: NDArray[np.int64], motion: MotionArrays, tables: OutputArrays
+    state: NDArray[np.void],
+    moment: NDArray[np.int64],
+    neighbours: Neighbours,
+    motion: MotionArrays,
+    tables: OutputArrays,
 ) -> int:
     """Return the number of cycles that must run beside a decision, so that none is late; 0 to decide before the next.
 
@@ -435,7 +441,7 @@ def _cycles_beside(
     switches beside a decision, because decisions change outputs as well.
     """
     s = state[0]
-    if s.most == 0 or _may_switch(s, motion, tables):
+    if s.most == 0 or _needs_python(s, neighbours) or _may_switch(s, motion, tables):
         return 0
     missing_ns = s.budget_ns - (s.deadline_ns + s.period_ns - _now_ns(state, moment))
     until_due = min(s.due if s.due >= s.cycle else NO_CYCLE, s.ends) - s.cycle
@@ -446,6 +452,7 @@ def _cycles_beside(
 def _request_decision(
     state: NDArray[np.void],
     moment: NDArray[np.int64],
+    neighbours: Neighbours,
     motion: MotionArrays,
     tables: OutputArrays,
     copies: NDArray[np.int64],
@@ -454,7 +461,7 @@ def _request_decision(
 
     Return False, and change nothing, if it must decide before the next cycle.
     """
-    s, number = state[0], _cycles_beside(state, moment, motion, tables)
+    s, number = state[0], _cycles_beside(state, moment, neighbours, motion, tables)
     if number == 0:
         return False
     s.beside, s.until = True, s.cycle + number
@@ -520,16 +527,16 @@ def _run_cycles(
     while s.cycle < s.until and s.batched < len(neighbours.batch):
         if s.most > 0 and not s.beside:
             s.decides = s.cycle >= min(s.due, s.ends) - s.lead
-            s.called = _is_called(state, moment, neighbours)
+            s.called = _await_call(state, moment, neighbours)
             if s.called or s.decides:
-                requested = _request_decision(state, moment, motion, tables, copies)
+                requested = _request_decision(state, moment, neighbours, motion, tables, copies)
                 if requested and s.injected_ns >= 0:
                     return Reached.DONE
         reached = _run_cycle(state, moment, neighbours, frames, robot, motion, tables)
         if reached != CONTINUE:
             return reached
         if (s.called or s.decides) and not s.beside:
-            requested = _request_decision(state, moment, motion, tables, copies)
+            requested = _request_decision(state, moment, neighbours, motion, tables, copies)
             if not requested or s.injected_ns >= 0:
                 return Reached.DONE
     return Reached.DONE

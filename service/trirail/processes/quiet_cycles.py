@@ -308,7 +308,8 @@ class QuietCycles:
 
     def record(self, overruns: Overruns) -> int:
         """Append the record of the newest cycle to the batch, and return the number of the cycle."""
-        state, self._robot.record["outputs"] = self._state, self._output_words  # a decision may have changed them
+        state = self._state
+        self._robot.record["outputs"] = self._output_words  # the decision before this cycle may have changed them
         state.overruns, state.batched = overruns.all, self._reports.batched
         number = int(quiet.record(self._tables[0], self._robot, self._reports.batch))
         self._reports.batched = state.batched

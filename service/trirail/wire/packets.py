@@ -188,7 +188,7 @@ class DecidedAhead(Struct, frozen=True, tag=True, omit_defaults=True):
     cycles: int
     """Number of these cycles; 0 if a fault in the present cycle ends them."""
     again: bool = False
-    """True if the control had already decided after the cycle before these."""
+    """True if it has just decided before the first of these cycles, with the inputs that were noted before this one."""
 
 
 class PlannerLost(Struct, frozen=True, tag=True):
