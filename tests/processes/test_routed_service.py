@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import signal
@@ -88,6 +87,12 @@ def through(hub: Hub) -> Robot:
 
 
 @pytest.mark.alone  # a stalled machine loses events
+def past_of_link(robot: Robot) -> list[str]:
+    """The past events of the link to the router."""
+    events = robot.events(history=True, timeout=1.0)
+    return [event.message for event in events if "the router" in event.message]
+
+
 def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub: Hub, service: Service) -> None:
     with through(hub) as robot, Fleet(hub.locator, "demo") as fleet:
         robot.enable()
@@ -108,12 +113,9 @@ def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub
         hub.start()
         assert moving.wait(WITHIN).outcome == "done"
         assert not next(state for state in robot.states(WITHIN) if not state.warnings).warnings
-        said = (event.message for event in robot.events(history=True, timeout=WITHIN) if "the router" in event.message)
-        assert list(itertools.islice(said, 3)) == [
-            f"linked to the router {hub.locator}",
-            lost,
-            f"linked to the router {hub.locator}",
-        ]
+        linked = f"linked to the router {hub.locator}"
+        # On a busy machine, zenoh may leave out the oldest past events; then they are asked for again.
+        assert any(past_of_link(robot)[:3] == [linked, lost, linked] for _ in range(5))
     with through(hub) as robot:
         until(robot, lambda state: state.mode == "holding")
         robot.disable()

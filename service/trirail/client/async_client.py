@@ -639,7 +639,7 @@ class AsyncRobot:
     def events(self, history: bool = False, timeout: float | None = None) -> AsyncGenerator[Event]:
         """Yield each event once, in order; with `history`, begin with the past events.
 
-        End after `timeout` seconds without an event.
+        End after `timeout` seconds without an event. On a busy machine, Zenoh may leave out the oldest past events.
         """
         return self._connection.events(history, seconds(timeout))
 
