@@ -446,7 +446,7 @@ def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: in
     recorded_words = [0, *records["outputs"][:, 0].tolist()]
     assert [change.bits for change in valve.pins.history] == changes(recorded_words)
     switches = [switch for each in events for switch in each.event.marks or () if switch.output == "valve"]
-    assert len(switches) > 10
+    assert len(switches) > 2
     for switch in switches:
         assert records["outputs"][switch.cycle - 1, 0] == (switch.value << OUTPUTS["valve"].bit)
 
