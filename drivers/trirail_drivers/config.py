@@ -233,7 +233,9 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     three missed heartbeats.
     """
     missed_positions: Annotated[int, Meta(ge=1, le=1000)] = 3
-    """Number of consecutive cycles without a position from a drive after which the drive is lost."""
+    """Number of consecutive cycles without a position from a drive after which the drive is lost. Statuswords of CiA
+    402 drives may be missing for the same time, and for at least 0.3 s.
+    """
     following_error: Distance = 0.005
     """Window of the following error [m] that the drives monitor, object 6065h; for ODrives, the driver monitors it. The
     window must be wider than `[limits.slider] following_error`, so that the service stops all three drives before a

@@ -117,6 +117,28 @@ def test_outputs_are_safe_without_power(rig: Rig, how: str) -> None:
     assert not rig.value("light")
 
 
+@pytest.mark.parametrize("how", [Command.DISABLE, Command.QUICK_STOP])
+def test_an_output_that_is_set_with_a_stop_in_the_same_cycle_stays_set(rig: Rig, how: Command) -> None:
+    rig.set("light", False)
+    rig.more.append(CommandRequest(1, "ann", how))
+    rig.cycle(CommandRequest(2, "ann", Command.SET_OUTPUT, SetOutput("light", False)))
+    rig.cycles(5)
+    assert not rig.value("light")
+
+
+def test_an_output_keeps_its_value_over_a_reset_and_is_safe_in_the_next_fault(rig: Rig) -> None:
+    rig.order("quick_stop")
+    rig.cycles(100)
+    rig.set("light", False)
+    assert isinstance(rig.command("reset"), CommandDone)
+    rig.cycles(3)
+    assert not rig.value("light")
+    rig.order("quick_stop")
+    rig.cycles(3)
+    assert rig.mode is Mode.FAULT
+    assert rig.value("light")
+
+
 def test_a_fault_makes_outputs_safe_in_its_cycle(rig: Rig) -> None:
     rig.set("valve", True)
     rig.drives.write((0.3, 0.0, 0.0), (0.0, 0.0, 0.0))  # a slider that is not where it should be

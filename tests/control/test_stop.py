@@ -54,6 +54,37 @@ def rig() -> ControlRig:
     return ControlRig()
 
 
+@pytest.mark.parametrize("name", [Command.STOP, Command.DISABLE, Command.ENABLE])
+@pytest.mark.parametrize("speed", [0.05, 1.0])
+def test_whoever_stops_again_and_again_delays_no_stop(name: Command, speed: float) -> None:
+    """Nor does what changes nothing while the robot brakes."""
+    braked = []
+    for again in (False, True):
+        rig = ControlRig()
+        rig.enable()
+        rig.goal("g", 0.1, 0.0, 0.0, speed=speed)
+        rig.cycles(150)
+        rig.cycle(CommandRequest(1, "ann", Command.STOP, carried("stop")))
+        number = 0
+        while rig.mode is Mode.STOPPING:
+            number += 1
+            rig.cycle(*(CommandRequest(10 + number, "ann", name, carried(name)),) * again)
+            assert number < 2000
+        braked.append(number)
+    assert braked[1] <= braked[0] + 1
+
+
+def test_what_changes_nothing_does_not_void_a_plan(rig: ControlRig) -> None:
+    rig.enable()
+    rig.planner.delay = 40
+    rig.post("g", PoseGoal(0.05, 0.0, 0.0))
+    for _ in range(4):
+        rig.cycles(8)
+        rig.order("enable")
+    rig.until(rig.holds)
+    rig.until(lambda: rig.outcomes() == [("g", "done")])
+
+
 @pytest.mark.parametrize("name", ["stop", "quick_stop", "disable", "override"])
 def test_goals_that_wait_at_override_zero_deafen_nothing(rig: ControlRig, name: str) -> None:
     rig.enable()

@@ -15,6 +15,7 @@ from _pytest.mark import ParameterSet
 from conftest import Rig, changed
 from control_rig import CONFIG
 from drivers.test_homing import incremental
+from msgspec import structs
 from trirail.config import Config
 from trirail.control.cycle import MAX_DISTANCE_STEPS
 from trirail.wire.packets import CommandDone, CommandRequest, Refused
@@ -389,6 +390,19 @@ def test_a_drive_that_does_not_leave_its_fault_is_not_reset(rig: Cia402Rig) -> N
     answer = rig.command("reset")
     assert isinstance(answer, Refused)
     assert "drive B: fault, error 0x2310 (continuous overcurrent of the motor)" in answer.message
+
+
+@pytest.mark.parametrize(("missed_positions", "within"), [(3, 0.3), (300, 0.3), (600, 0.6)])
+def test_statuswords_may_be_missing_for_as_long_as_positions(missed_positions: int, within: float) -> None:
+    drives = structs.replace(REAL.drives, missed_positions=missed_positions)
+    rig = Cia402Rig(structs.replace(REAL, drives=drives))
+    holding(rig)
+    rig.inject("B drop tpdo1")
+    cycles = rig.until(rig.faulty, 800)
+    assert within - 0.1 <= cycles * PERIOD <= within + 0.15  # the last one came up to 0.1 s ago
+    assert rig.control.fault is not None
+    assert "drive B: no statusword" in rig.control.fault
+    rig.bus.shutdown()
 
 
 def test_a_warning_of_the_bus_is_an_event(rig: Cia402Rig) -> None:

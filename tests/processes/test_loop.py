@@ -345,6 +345,22 @@ def test_it_ends_when_the_robot_has_no_power(shell: Shell) -> None:
     assert shell.loop._has_ended()
 
 
+def test_who_enables_while_the_service_ends_moves_nothing(shell: Shell) -> None:
+    shell.enabled()
+    shell.loop.ending = True
+    shell.cycles(1)
+    assert shell.mode() is Mode.DISABLED
+    shell.gateway.send(message(CommandRequest(2, "ann", Command.ENABLE)))
+    shell.cycles(2)
+    for ticket in range(3, 40):
+        shell.send(ticket, f"g-{ticket}", PoseGoal(0.05, 0.0, 0.0))
+        shell.cycles(1)
+        assert shell.mode() in (Mode.ENABLING, Mode.HOLDING, Mode.DISABLED)
+    shell.cycles(20)
+    assert shell.mode() is Mode.DISABLED
+    assert shell.loop._has_ended()
+
+
 def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) -> None:
     shell.enabled()
     shell.rig.drives[1].fail(0x4310)

@@ -19,7 +19,9 @@ from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
 MISSED_STATUSES = 3
-FOLLOW_TIME = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
+STATUS_WITHIN = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
+"""Least time without a statusword after which a drive is lost [s]."""
+FOLLOW_TIME = STATUS_WITHIN
 """Longest time until an enabled drive reports that it follows setpoints [s]."""
 REGISTER_TIME = 0.5
 """Longest time until a drive reports its error register after a reset [s]."""
@@ -54,7 +56,7 @@ class Cia402Axis(Axis):
         self.velocity_step, self.velocity_bytes = 1.0, 4
         self.still = max(1.0, abs(scale.counts_per_metre) * STANDSTILL_DISTANCE_M)
         self.status_heard = self.stands_since = math.inf
-        self.status_within = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
+        self.status_within = STATUS_WITHIN
         self.has_setpoint = False
         """Whether the drive has been sent a setpoint."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON

@@ -20,7 +20,7 @@ from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import packed_frames
 from trirail_drivers.bus.reopening import Reopening
 from trirail_drivers.cia402 import canopen_frames, process_data, setup
-from trirail_drivers.cia402.axis import Cia402Axis
+from trirail_drivers.cia402.axis import STATUS_WITHIN, Cia402Axis
 from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import describe_protection
 from trirail_drivers.cia402.one_drive import HAS_POWER, SetUp, Start
@@ -97,6 +97,7 @@ class Cia402(Driver[Cia402Axis]):
         for axis in self._axes:
             exchange = process_data.default_exchange(axis.node, axis.io, velocity_offset=plan.velocity_offset)
             axis.set_up(exchange, axis.units)
+            axis.status_within = max(STATUS_WITHIN, self._drives.missed_positions * period)
         scales = tuple(axis.scale for axis in self._axes)
         ones = setup.setup_tasks(
             self._wire.bus, self._drives, scales, period, self._clock, io, velocity_offset=plan.velocity_offset

@@ -257,7 +257,7 @@ class _Ahead:
                 control.modes.cycle += 1
             self._pending.popleft()
             self._last, self._known = cycle + ahead.cycles, control.measured.snapshot()
-            control.ahead = ahead.cycles
+            control.begin_ahead(ahead.cycles)
 
     def _next_ahead(self, cycle: int) -> DecidedAhead | None:
         """Return the note of a decision that was made beside the cycles after cycle `cycle`; None if there is none."""

@@ -79,7 +79,9 @@ def homed(now: CommandProgress) -> str | None:
     """Return "" once every slider is homed."""
     if now.mode in (Mode.HOMING, Mode.STOPPING):
         return None
-    return "" if now.measured.homed else now.latched or "homing was stopped before all drives were homed"
+    if now.measured.homed and now.mode is not Mode.FAULT:
+        return ""
+    return now.latched or "homing was stopped before all drives were homed"
 
 
 def cleared(now: CommandProgress) -> str | None:

@@ -22,7 +22,7 @@ from trirail.control.commands import Commands
 from trirail.control.feedback import MeasuredState
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.lease import LeaseArbiter
-from trirail.control.ledger import Ledger
+from trirail.control.ledger import ActiveGoal, Ledger
 from trirail.control.modes import ModeEvent, ModeState
 from trirail.control.outputs import Outputs
 from trirail.control.path_checks import PathChecks
@@ -119,6 +119,8 @@ class Control:
         """Whether the setpoints of the current cycle have been sent."""
         self.ahead = 0
         """Number of cycles between the newest feedback that the control knows and the present commanded motion."""
+        self._goal_before = ""
+        """Id of the goal that was active before the newest decision beside the cycles; "" if there was none."""
         self._edges: list[tuple[str, bool, Triple]] = []
         """Digital inputs that have changed: name, new value, and pose of the robot. They have not been handled yet."""
 
@@ -206,10 +208,15 @@ class Control:
 
         Decisions then take effect after these cycles. They know the feedback of the drives before these cycles.
         """
-        self.ahead = number
+        self.begin_ahead(number)
         self.advance(number)
         self.modes.cycle += number - 1
         self.conclude()
+
+    def begin_ahead(self, number: int) -> None:
+        """Note that the next decisions take effect after `number` further cycles."""
+        goal = self.ledger.goal
+        self.ahead, self._goal_before = number, goal.id if goal is not None else ""
 
     def advance(self, number: int) -> None:
         """Advance the commanded motion by a number of cycles. The control does not evaluate these cycles."""
@@ -225,7 +232,9 @@ class Control:
         """Let a decision take effect that was made beside the newest cycles, and handle edges of inputs among them."""
         self.ahead = 0
         if self._edges:
-            self._handle_edges()
+            goal = self.ledger.goal
+            began_before = goal is not None and goal.id == self._goal_before
+            self._handle_edges(goal if began_before else None)  # edges from before a goal do not concern it
             self.decide(())
 
     def return_to(self, newest: int) -> None:
@@ -300,7 +309,7 @@ class Control:
             behind = self.measured.update(feedback, self._at_rest)
         self.report_feedback(before, feedback)
         if not self.ahead:
-            self._handle_edges()
+            self._handle_edges(self.ledger.goal)
         mode = self.state.mode
         if feedback.fault is not None:
             drive, cause, code, message = feedback.fault
@@ -384,10 +393,9 @@ class Control:
             )
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
 
-    def _handle_edges(self) -> None:
+    def _handle_edges(self, goal: ActiveGoal | None) -> None:
         """Report digital inputs that have changed, and stop the current goal if it ends at one of these edges."""
-        goal, edges = self.ledger.goal, self._edges
-        self._edges = []
+        edges, self._edges = self._edges, []
         for name, value, (x, y, phi) in edges:
             words = (
                 f"input {name} switched {'on' if value else 'off'} at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm, phi "

@@ -170,6 +170,10 @@ def switch(
     return number
 
 
+_SAFE_IN = (Mode.DISABLED, Mode.FAULT)
+"""Modes in which outputs have their safe values."""
+
+
 class Outputs:
     """Digital outputs and inputs of a robot, by their names in the configuration."""
 
@@ -199,7 +203,7 @@ class Outputs:
         self._built_for: tuple[Run | None, int, int] = (None, -1, 0)
         self._first = [0] * len(self._names)
         """First row of the table for each output."""
-        self._safe_in: Mode | None = None
+        self._mode: Mode | None = None
         self._reported = 0
         """Cycle in which switches were last reported."""
 
@@ -224,7 +228,7 @@ class Outputs:
     def set(self, name: str, value: bool, mode: Mode) -> None:
         """Set an output now. Raises RefusedError if the output is unknown or the mode does not allow the change."""
         output = self._find(name)
-        if mode in (Mode.DISABLED, Mode.FAULT) and not output.always:
+        if mode in _SAFE_IN and not output.always:
             code = RefusalCode.FAULT if mode is Mode.FAULT else RefusalCode.NOT_ENABLED
             safe, where = "on" if output.safe else "off", "in fault" if mode is Mode.FAULT else mode
             raise RefusedError(
@@ -232,16 +236,19 @@ class Outputs:
                 f"output {name!r} stays at its safe value, {safe}, while the robot is {where}: "
                 "send enable first, or set always = true for this output in the configuration",
             )
+        self.follow_mode(mode)  # otherwise the next cycle would reset the output
         row = self.state[self._names.index(name)]
         row["until"] = row["goal"] = 0
         self._write(self._names.index(name), value)
 
     def follow_mode(self, mode: Mode) -> None:
-        """Set all outputs to their safe values if the robot has just become disabled or gone into fault."""
-        if mode is not self._safe_in:
-            self._safe_in = mode
-            if mode in (Mode.DISABLED, Mode.FAULT):
-                self.make_safe()
+        """Set all outputs to their safe values if the robot has just become disabled or gone into fault.
+
+        A reset changes no output: all have had their safe values since the fault, unless somebody has set one.
+        """
+        before, self._mode = self._mode, mode
+        if mode is not before and mode in _SAFE_IN and (before, mode) != (Mode.FAULT, Mode.DISABLED):
+            self.make_safe()
 
     def make_safe(self) -> None:
         """Set all outputs to their safe values, and end active pulses and stretches."""

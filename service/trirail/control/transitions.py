@@ -111,8 +111,8 @@ class Transitions:
         `goal` is the goal that the event starts, or None.
         """
         decided = step(self.state, event)
-        if isinstance(decided, Refusal):
-            return
+        if isinstance(decided, Refusal) or decided == Step(self.state):
+            return  # repeated stops must not restart the search for a law that brakes
         self._act(decided)
         if event is ModeEvent.INPUT_EDGE:
             self._edge = reason

@@ -46,6 +46,9 @@ MAX_SHUTDOWN_S = 3.0
 After this time the loop ends, and the drives stop by themselves.
 """
 
+_STILL_IN_USE = (Mode.ENABLING, Mode.HOMING, Mode.HOLDING, Mode.MOVING)
+"""Modes in which a robot is only if a request arrived after the end of the service was announced."""
+
 
 class TimeBudget:
     """Time that a decision needs, which is longer on a slower machine.
@@ -379,8 +382,8 @@ class Loop:
             yield Disturbance(ModeEvent.LATE.name, late.text, **late.fields)
         if (lost := self._gateway.lost()) is not None:
             yield Disturbance(ModeEvent.GATEWAY_LOST.name, lost.text, **lost.fields)
-        if self.ending and self._ending_since is None:
-            self._ending_since = self.control.cycles
+        if self.ending and (self._ending_since is None or self.control.state.mode in _STILL_IN_USE):
+            self._ending_since = self._ending_since or self.control.cycles
             end = coded("the service is ending: controlled stop, drives disabled", EventCode.SHUTDOWN)
             yield Disturbance(ModeEvent.SHUTDOWN.name, end.text, **end.fields)
 
