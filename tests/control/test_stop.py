@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
 from trirail.wire.event_codes import EventCode, coded
-from trirail.wire.goals import Goal, MoveGoal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
+from trirail.wire.goals import (
+    Goal,
+    MoveGoal,
+    PoseGoal,
+    SlidersGoal,
+    TrackGoal,
+    TrajectoryGoal,
+    TrajectoryPoint,
+    VelocityGoal,
+)
 from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, GoalRequest, Refused
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override, Stop
 
@@ -54,22 +63,35 @@ def rig() -> ControlRig:
     return ControlRig()
 
 
+def circles(number: int, duration: float, radius: float) -> TrajectoryGoal:
+    """Three turns of a circle, from rest to rest, as a number of points."""
+    points = []
+    for u in np.linspace(0.0, 1.0, number).tolist():
+        angle = 6.0 * math.pi * u * u * (3.0 - 2.0 * u)
+        x, y = radius * (math.cos(angle) - 1.0), radius * math.sin(angle)
+        points.append(TrajectoryPoint(duration * u, x, y, 0.0))
+    return TrajectoryGoal(tuple(points), settle=False)
+
+
 @pytest.mark.parametrize("name", [Command.STOP, Command.DISABLE, Command.ENABLE])
-@pytest.mark.parametrize("speed", [0.05, 1.0])
-def test_whoever_stops_again_and_again_delays_no_stop(name: Command, speed: float) -> None:
-    """Nor does what changes nothing while the robot brakes."""
+@pytest.mark.parametrize(
+    ("goal", "cycles"), [(PoseGoal(0.1, 0.0, 0.0), 150), (circles(3000, 9.1, 0.015), 3640)], ids=["line", "circles"]
+)
+def test_whoever_stops_again_and_again_delays_no_stop(goal: Goal, cycles: int, name: Command) -> None:
+    """Nor does what changes nothing while the robot brakes. It takes cycles to find out how a long path is braked."""
     braked = []
     for again in (False, True):
         rig = ControlRig()
         rig.enable()
-        rig.goal("g", 0.1, 0.0, 0.0, speed=speed)
-        rig.cycles(150)
+        assert isinstance(rig.send("g", goal), Accepted)
+        rig.cycles(cycles)
+        assert not rig.outcomes()
         rig.cycle(CommandRequest(1, "ann", Command.STOP, carried("stop")))
         number = 0
         while rig.mode is Mode.STOPPING:
             number += 1
-            rig.cycle(*(CommandRequest(10 + number, "ann", name, carried(name)),) * again)
-            assert number < 2000
+            rig.cycle(CommandRequest(10 + number, "ann", name, carried(name)) if again else None)
+            assert number < 1000
         braked.append(number)
     assert braked[1] <= braked[0] + 1
 
