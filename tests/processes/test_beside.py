@@ -428,6 +428,38 @@ def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
     assert not differs.any(), int(np.argmax(differs)) + 1
 
 
+def test_an_edge_from_before_the_start_of_a_goal_does_not_end_it(tmp_path: Path) -> None:
+    """It is noticed in the last cycle before the goal, beside the decision that starts the goal."""
+    config = structs.replace(CONFIGS["cia402"], inputs=INPUTS)
+    session = Session(config, tmp_path, "unix", quiet=True)
+    quiet = quiet_of(session)
+    quiet.beside = 2, 2
+    decide = quiet._answer
+
+    def press_at_start() -> None:
+        before = session.loop.control.ledger.goal
+        decide()
+        if before is None and session.loop.control.ledger.goal is not None:
+            session.drives.press(1, 1 << INPUTS["part"].bit)
+
+    quiet._answer = press_at_start  # type: ignore[method-assign]
+    goal = PoseGoal(0.03, 0.0, 0.0, stop_at=StopAt("part", "rising"))
+    happens = {
+        30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+        150: [Happening(lambda session: session.ask(GoalRequest(2, "ann", "g", goal, 0)))],
+    }
+    try:
+        records, inputs, events = recorded(session, happens, 800)
+    finally:
+        session.close()
+    (noticed,) = np.flatnonzero(np.diff(records["inputs"][:, 1]))
+    assert MODES[records["mode"][noticed + 1]] is Mode.HOLDING
+    assert MODES[records["mode"][noticed + 2]] is Mode.MOVING
+    (ended,) = (each.event for each in events if each.event.outcome is not None)
+    assert "arrived" in ended.message
+    assert not replayed(config, records, inputs).any()
+
+
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.generated(4125785050, 0, 1, 2, 3)
 def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: int, tmp_path: Path) -> None:
