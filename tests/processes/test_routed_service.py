@@ -86,13 +86,13 @@ def through(hub: Hub) -> Robot:
             return robot
 
 
-@pytest.mark.alone  # a stalled machine loses events
 def past_of_link(robot: Robot) -> list[str]:
     """The past events of the link to the router."""
     events = robot.events(history=True, timeout=1.0)
     return [event.message for event in events if "the router" in event.message]
 
 
+@pytest.mark.alone  # a stalled machine loses events
 def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub: Hub, service: Service) -> None:
     with through(hub) as robot, Fleet(hub.locator, "demo") as fleet:
         robot.enable()
