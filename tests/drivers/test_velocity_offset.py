@@ -245,13 +245,21 @@ def test_the_mapping_of_the_drives_is_that_of_the_frames(closing: Closing, files
         assert held == {(0x1601, 0): 1, (0x1601, 1): TARGET, (0x1401, 2): 1, (0x1A01, 0): 1}
 
 
-def test_a_drive_adds_no_offset_that_another_set_up_has_left(closing: Closing, files: dict[str, Path]) -> None:
+@pytest.mark.parametrize("rate", [500, FAST])
+@pytest.mark.parametrize("lacks", [(), (0x60B0,), (0x60B1,), (0x60B2,), (0x60B0, 0x60B1, 0x60B2)])
+def test_a_drive_adds_no_offset_that_another_program_has_left(
+    closing: Closing, tmp_path: Path, rate: int, lacks: tuple[int, ...]
+) -> None:
     """A service that died in a motion leaves its last offset in a drive that keeps its supply."""
-    rig = closing(Rig(files))
+    path = tmp_path / "offsets.eds"
+    path.write_text(eds([*OWN, (0x60B0, 0, 4, "rw", 0, True), (0x60B2, 0, 3, "rw", 0, True)], lacks=lacks))
+    rig = closing(Rig({MAPPABLE: path}))
+    there = {0x60B0, 0x60B1, 0x60B2} - {*lacks}
     for device in rig.devices:
-        device.objects[0x60B1, 0].value = 50_000
-    rig.powered(FAST)
-    assert [device.objects[0x60B1, 0].value for device in rig.devices] == [0] * 3
+        for index in there:
+            device.objects[index, 0].value = 5000
+    rig.powered(rate)
+    assert [device.objects[index, 0].value for device in rig.devices for index in there] == [0] * 3 * len(there)
     assert rig.cycles(50, START).position == pytest.approx(START, abs=1e-6)
 
 

@@ -35,6 +35,8 @@ _IDENTIFIER: Final = 0x7FF
 EVERY_SYNC: Final = 1
 ON_CHANGE: Final = 255
 """Transmission types."""
+_OFFSETS: Final = {0x60B0: "position", 0x60B1: "velocity", 0x60B2: "torque"}
+"""Offsets that a drive adds to the setpoints of mode 8 (CiA 402-2)."""
 
 
 class PdoParameters(NamedTuple):
@@ -112,18 +114,20 @@ class Pdos:
             control = pdo.identifier
         if offset and not chosen.has_velocity:
             self._drive.lack((0x60B1, 0), "it cannot be mapped into the setpoint's PDO")
-        if not velocity_offset:
-            await self._leave_out_offset(mode, mapped=chosen.has_velocity)
+        if chosen.has_velocity and not velocity_offset:
+            self._drive.add_note("the fixed mapping of its setpoints contains the velocity offset, which stays in use")
+        if mode == CYCLIC_SYNCHRONOUS_POSITION:
+            await self._clear_offsets(chosen)
         return chosen, control
 
-    async def _leave_out_offset(self, mode: int, *, mapped: bool) -> None:
-        """Set a velocity offset that no PDO contains to 0: another set-up may have left a value in the drive, which the
-        drive would add to the velocity of every setpoint.
+    async def _clear_offsets(self, chosen: SetpointPdo) -> None:
+        """Set the offsets that the setpoints do not contain to 0: another program may have left values in the drive,
+        which the drive would add to every setpoint.
         """
-        if mapped:
-            self._drive.add_note("the fixed mapping of its setpoints contains the velocity offset, which stays in use")
-        elif mode == CYCLIC_SYNCHRONOUS_POSITION and (held := await self._remote.peek(0x60B1)):
-            await self._drive.put((0x60B1, 0), held, 0, "no velocity offset")
+        for index, name in _OFFSETS.items():
+            mapped = index == VELOCITY_OFFSET >> 16 and chosen.has_velocity
+            if not mapped and (held := await self._remote.peek(index)):
+                await self._drive.put((index, 0), held, 0, f"no {name} offset")
 
     async def outputs(self) -> int | None:
         """Set up the SYNC-driven RPDO of the digital outputs; return its identifier, or None if no RPDO is suitable."""

@@ -76,7 +76,7 @@ _WINDOW_OFF: Final = 0xFFFFFFFF
 
 
 class Profile:
-    """CiA 402 objects of a drive. Missing objects have defaults: 6007h is 0, 605Ah is 2, 6065h is off, 60B1h is 0."""
+    """CiA 402 objects of a drive. Missing objects have defaults: 6007h is 0, 605Ah is 2, 6065h is off, 60B0h and 60B1h are 0."""
 
     def __init__(self, objects: Dictionary, mechanics: Mechanics, mode_changed: Callable[[], None]) -> None:
         self._mode_changed = mode_changed
@@ -102,6 +102,7 @@ class Profile:
         self._homing_speeds = o.internal(0x6099, 1), o.internal(0x6099, 2)
         self._homing_acceleration = o.internal(0x609A, 0)
         self._home_offset = o.internal(0x607C, 0)
+        self._position_offset = o.internal(0x60B0, 0)
         self._velocity_offset = o.internal(0x60B1, 0)
         self._data_record = o.internal(0x60C1, 1)
         self._period, self._exponent = o.internal(0x60C2, 1), o.internal(0x60C2, 2, -3)
@@ -137,9 +138,11 @@ class Profile:
 
     @property
     def setpoint(self) -> float:
-        """Position setpoint [counts]: 607Ah, or 60C1h in mode 7."""
-        entry = self._data_record if self.mode.value == INTERPOLATED_POSITION else self._target
-        return entry.value * self.units.position
+        """Position setpoint [counts]: 607Ah, plus 60B0h in mode 8, or 60C1h in mode 7."""
+        if self.mode.value == INTERPOLATED_POSITION:
+            return self._data_record.value * self.units.position
+        offset = self._position_offset.value if self.mode.value == CYCLIC_SYNCHRONOUS_POSITION else 0
+        return (self._target.value + offset) * self.units.position
 
     def hold(self) -> None:
         """Set the setpoint to the actual position."""
