@@ -15,6 +15,7 @@ import msgspec
 import pytest
 from rigs import OFF, START, STEP, Bus, Clock, Closing, DriverRig, frame, ideal_servo
 from trirail_drivers.cia402 import canopen_frames
+from trirail_drivers.cia402.axis import STANDSTILL_TIME_S
 from trirail_drivers.cia402.drives import REPEAT_AFTER, Cia402
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.settings import interpolation_periods
@@ -534,6 +535,28 @@ class TestClose:
         assert [device.state for device in enabled.devices] == [P.SWITCH_ON_DISABLED] * 3
         assert 0.5 / 10.0 <= enabled.clock.now - before < 0.5 / 10.0 + 0.02
         assert enabled.commands() == [[0x02, 0x00]] * 3
+
+    def test_a_long_ramp_ends_without_a_lost_heartbeat(self, closing: Closing) -> None:
+        rig = closing(Rig(msgspec.structs.replace(CONFIG, quick_stop_deceleration=0.6, stop_timeout=2.0)))
+        rig.drives.configure(PERIOD)
+        rig.enable()
+        rig.move(100, (0.5, 0.5, 0.5))
+        before = rig.clock.now
+        rig.drives.close()
+        assert [device.state for device in rig.devices] == [P.SWITCH_ON_DISABLED] * 3
+        assert [device.objects[0x603F, 0].value for device in rig.devices] == [0] * 3
+        assert 0.5 / 0.6 <= rig.clock.now - before < 0.5 / 0.6 + 0.02
+
+    @pytest.mark.parametrize("option", [5, 6, 7, 8])
+    def test_drives_that_keep_power_after_their_ramp_lose_it_at_standstill(self, enabled: Rig, option: int) -> None:
+        for device in enabled.devices:
+            device.objects[0x605A, 0].value = option
+        enabled.move(100, (0.5, 0.5, 0.5))
+        before = enabled.clock.now
+        enabled.drives.close()
+        assert [device.state for device in enabled.devices] == [P.SWITCH_ON_DISABLED] * 3
+        ramp = 0.5 / 10.0 + STANDSTILL_TIME_S
+        assert enabled.clock.now - before == pytest.approx(ramp, abs=0.02)
 
     def test_before_and_after_a_failed_set_up(self) -> None:
         rig = Rig()

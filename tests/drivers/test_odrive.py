@@ -443,6 +443,21 @@ class TestReset:
         ready.found("fault", within=35)
 
 
+@pytest.mark.parametrize("errors", [0, int(Error.CURRENT_LIMIT_VIOLATION)])
+def test_a_drive_whose_state_is_unknown_has_restarted_only_if_it_says_so(ready: Rig, errors: int) -> None:
+    """A new set-up forgets the state. Answers to requests for errors may come before the next heartbeat."""
+    axis = ready.drives._axes[0]
+    axis.silent = True
+    axis.forget_power_state()
+    axis.on_errors(cansimple.ERRORS.pack(errors, 0), ready.clock.now)
+    assert not axis.restarted
+    assert axis.event is None
+    starting = [int(Error.INITIALIZING), 0] if errors else [0, int(Error.INITIALIZING)]
+    axis.on_errors(cansimple.ERRORS.pack(*starting), ready.clock.now)
+    assert axis.restarted
+    assert axis.boots == 1
+
+
 class TestClose:
     def test_while_moving_brakes_by_the_ramp_first(self, enabled: Rig) -> None:
         enabled.move(100)

@@ -531,9 +531,8 @@ class Cia402(Driver[Cia402Axis]):
     def _wants_power(self) -> bool:
         return self._wanted is PowerState.OPERATION_ENABLED
 
-    def _wait_for_standstill(self, deadline: float) -> None:
-        while self._powered() and (left := deadline - self._clock()) > 0:
-            self._wire.wait(left, self._clock)
+    def _continue_stop(self) -> None:
+        self._command()
 
     @staticmethod
     def _describe_protection(protection: str) -> str:

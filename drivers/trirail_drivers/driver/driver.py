@@ -181,6 +181,10 @@ class Driver(ABC, Generic[AnyAxis]):
         self._wire.close()
 
     @abstractmethod
+    def sync(self) -> None:
+        """Begin a cycle; see trirail_drivers.interface.DriveGroup."""
+
+    @abstractmethod
     def quick_stop(self) -> None:
         """Begin the quick-stop ramp of every drive in this cycle."""
 
@@ -198,8 +202,19 @@ class Driver(ABC, Generic[AnyAxis]):
         """Whether the drives are commanded to have power."""
 
     @abstractmethod
+    def _continue_stop(self) -> None:
+        """Send the commands that the stopping drives need at the end of a cycle."""
+
     def _wait_for_standstill(self, deadline: float) -> None:
-        """Run cycles until the stopping drives have lost power, or until `deadline` [s]."""
+        """Run cycles until the stopping drives have lost power, or until `deadline` [s].
+
+        Drives may need the cycles for their ramps, and the heartbeats so that they do not report a lost service.
+        """
+        while self._powered() and (now := self._clock()) < deadline:
+            self.sync()
+            while (left := now + self._period - self._clock()) > 0.0:
+                self._wire.wait(left, self._clock)
+            self._continue_stop()
 
     def _make_outputs_safe(self) -> None:
         """Set the outputs to their safe values and wait for the answers, if the protocol has outputs."""

@@ -97,7 +97,7 @@ class OdriveAxis(Axis):
         self.position = self.scale.metres(turns)
         self.state, self.reported, self._started = state, True, True
         self.note_request(AxisState.IDLE)
-        self._update_errors(errors)
+        self._update_errors(errors, state)
 
     def rejoin(self, now: float) -> None:
         """Let the drive take part in the cycle again after a set-up in the background."""
@@ -124,14 +124,14 @@ class OdriveAxis(Axis):
         """Handle Get_Error: active errors and disarm reason."""
         active, reason = cansimple.ERRORS.unpack(data)
         self.reported = True
-        self._update_errors(active | reason)
+        self._update_errors(active | reason)  # the state may be unknown, which does not show a restart
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Handle a heartbeat: axis state, errors and procedure result."""
         errors, self.state, self._result, _ = cansimple.BEAT.unpack(data)
         self.heard = now
         self._beats += 1
-        self._update_errors(errors)
+        self._update_errors(errors, self.state)
         if not cansimple.is_starting(self.state, errors):
             self._started = True
         if self.state == AxisState.CLOSED_LOOP_CONTROL:
@@ -207,12 +207,13 @@ class OdriveAxis(Axis):
         """Whether the newest heartbeat was sent after the drive received the last request."""
         return self._beats > STALE_HEARTBEATS
 
-    def _update_errors(self, errors: int) -> None:
+    def _update_errors(self, errors: int, state: int = AxisState.IDLE) -> None:
+        """Store the errors of a message, and watch for a restart; `state` is the axis state in the message, if any."""
         self.errors = errors
         if not errors:
             self.reset_until = -math.inf
         # A drive that has finished booting reports INITIALIZING or an undefined state only if it boots again.
-        if self._started and cansimple.is_starting(self.state, errors):
+        if self._started and cansimple.is_starting(state, errors):
             self._note_restart()
 
     def _note_restart(self) -> None:

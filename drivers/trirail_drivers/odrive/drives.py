@@ -345,8 +345,5 @@ class Odrive(Driver[OdriveAxis]):
             return None if self._setpoints.stopping else AxisState.IDLE
         return AxisState.CLOSED_LOOP_CONTROL if self._setpoints.sent else None
 
-    def _wait_for_standstill(self, deadline: float) -> None:
-        while self._powered() and (now := self._clock()) < deadline:  # the cycle generates the ramp
-            self.sync()
-            while (left := now + self._period - self._clock()) > 0.0:
-                self._wire.wait(left, self._clock)
+    def _continue_stop(self) -> None:
+        """Do nothing, since `sync` generates the ramp."""
