@@ -161,13 +161,20 @@ def test_a_second_node_with_the_same_id_is_refused_by_the_set_up(closing: Closin
 @pytest.mark.parametrize("data", [b"\x00", b"\x7f"])
 @pytest.mark.parametrize("after", [0, 7])
 def test_a_second_node_that_is_plugged_in_is_named(rig: Rig, data: bytes, after: int) -> None:
-    """It boots, or sends heartbeats of its own, while the drive goes on: all stop at once, and soon it is known why."""
+    """It boots, or sends heartbeats of its own, while the drive goes on: all stop at once, and soon it is known why.
+
+    After a boot-up message, the set-up of the drive is checked again: the drive itself may have booted.
+    """
     for _ in range(after):
         rig.cycle(rig.target)
     with stranger(rig) as bus:
         bus.send(frame(0x702, data))
         assert stopped_within(rig, 1).startswith("drive B: ")
         assert "drive B: a second node with id 2 on the bus: one node has booted, or is not" in rig.last_fault(6)
+    for _ in range(10_000):
+        if rig.drives._axes[1].configured:
+            break
+        rig.cycle(rig.target)
     rig.drives.reset()
     assert rig.cycles(100).fault is None, "it has gone"
 
@@ -189,6 +196,21 @@ def test_a_drive_that_has_left_operational_is_no_second_one(rig: Rig, in_flight:
 def test_a_restart_is_noticed(rig: Rig) -> None:
     rig.nodes[0].boot()
     assert "drive A: has restarted" in stopped_within(rig, 1)
+
+
+def test_a_drive_that_boots_within_a_cycle_and_starts_by_itself_is_configured_again(rig: Rig) -> None:
+    """Its positions look like those of a second node, but it has lost its set-up."""
+    node, window = rig.nodes[0], rig.nodes[0].value(0x6065)
+    node.boot()
+    node.nmt = OPERATIONAL
+    assert node.value(0x6065) != window
+    assert "drive A: " in stopped_within(rig, 1)
+    for _ in range(10_000):
+        rig.cycle(rig.target)
+        if rig.drives._axes[0].configured:
+            break
+    assert rig.cycle(rig.target).unready[0] is None
+    assert node.value(0x6065) == window
 
 
 @pytest.mark.core

@@ -309,7 +309,7 @@ class Cia402Axis(Axis):
         if self._answers_per_sync.from_two_nodes():
             self.note_fault("frame", 0, warning(self.node, "each SYNC has two positions"))
         if mistaken is not None:
-            self.restarted = self.left_operational = self.pdo_silent = False
+            self.left_operational = self.pdo_silent = False
             by = "one node has booted, or is not operational, while the other sends positions"
             self.event = self.make_fault("frame", 0, warning(self.node, by))
         return mistaken
