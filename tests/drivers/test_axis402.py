@@ -110,6 +110,18 @@ def test_a_fault_has_the_code_of_its_emergency_until_it_is_over() -> None:
     assert axis.find_fault(T, WANTED) is None
 
 
+@pytest.mark.parametrize("register", [0x01, 0x08, 0x80])
+def test_an_error_persists_while_the_error_register_shows_one(register: int) -> None:
+    """CiA 301: an emergency with code 00xxh may report that one error of several has ended."""
+    axis = made()
+    axis.on_emergency(ERROR, T)
+    axis.event = None
+    axis.on_emergency(canopen_frames.EMERGENCY.pack(0, register, bytes(5)), T)
+    assert axis.find_fault(T, WANTED) is not None
+    axis.on_emergency(OVER, T)
+    assert axis.find_fault(T, WANTED) is None
+
+
 def test_a_drive_that_has_left_its_fault_has_no_code_of_it() -> None:
     axis = made()
     axis.on_status(FAULT, T)

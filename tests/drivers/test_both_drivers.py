@@ -33,6 +33,13 @@ def test_a_bus_that_takes_no_frame_is_one_on_which_no_drive_answers(new: AnyRig)
         new.drives.configure(STEP)
 
 
+def test_a_bus_that_is_lost_during_the_set_up_is_no_missing_drive(new: AnyRig) -> None:
+    new.bus.inject(0x020, bytes(8), is_error_frame=True)
+    new.bus.inject(0x040, bytes(8), is_error_frame=True)
+    with pytest.raises(BusError, match=r"cannot use .*: bus-off"):
+        new.drives.configure(STEP)
+
+
 def test_a_missing_drive_is_named(new: AnyRig) -> None:
     new.devices[1].silent = True
     with pytest.raises(DriveTimeout, match=new.first_asked) as caught:

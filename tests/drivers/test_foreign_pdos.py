@@ -24,6 +24,19 @@ def test_no_pdo_is_on_but_those_that_are_used_and_none_of_them_waits(closing: Cl
         assert [node.value(index, 3) for index in on if index >= 0x1800] == [0] * (1 + (way.status is not None))
 
 
+@pytest.mark.parametrize("name", MAKES)
+@pytest.mark.parametrize("held_back", [False, True])
+def test_no_frames_are_heard_but_those_of_the_set_up(closing: Closing, name: str, held_back: bool) -> None:
+    """A drive whose statusword comes beside its position does not use the identifier of TPDO1, and another node may."""
+    slow = Habits(values={(0x1800, 3): 1000}, access={(0x1800, 3): "ro"}) if held_back else Habits()
+    rig = closing(Rig(name, slow))
+    rig.ready()
+    for axis in rig.drives._axes:
+        way = axis.exchange
+        used = {way.feedback.identifier, way.status, way.emergency, 0x700 + axis.node, 0x580 + axis.node} - {None}
+        assert {number for number, (owner, _) in rig.drives._wire._handlers.items() if owner is axis} == used
+
+
 def test_a_statusword_that_may_be_held_back_is_taken_from_beside_the_position(closing: Closing) -> None:
     rig = closing(Rig("elmo_gold", Habits(values={(0x1800, 3): 1000}, access={(0x1800, 3): "ro"})))
     rig.ready()

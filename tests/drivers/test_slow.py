@@ -100,6 +100,16 @@ def test_a_drive_that_never_boots_is_told_with_the_time_that_it_was_given(closin
     rig.drives.close()
 
 
+def test_a_drive_that_boots_again_and_again_is_told(closing: Closing) -> None:
+    """It answers no request before it boots again."""
+    rig = closing(SlowRig("elmo_gold", lambda node: Slowness(answer=lambda: 60.0 * (node == 2))))
+    for number in range(1, 200):
+        rig.wires.slow[1].boots_in(0.2 * number)
+    said = r"^drive B: no answer for object 1000:00 \(Device type\), only boot-up messages, within 10\S* s; "
+    with pytest.raises(DriveTimeout, match=said):
+        rig.drives.configure(PERIOD)
+
+
 def test_a_drive_that_restarts_while_it_is_set_up_is_told(closing: Closing) -> None:
     rig = closing(SlowRig("elmo_gold", lambda _: Slowness(answer=lambda: 0.01)))
     rig.wires.slow[2].boots_in(0.5)

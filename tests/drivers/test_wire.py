@@ -147,6 +147,17 @@ def test_only_data_frames_of_the_identifier_are_heard(rig: Rig) -> None:
     assert rig.listener.told == []
 
 
+def test_a_listener_that_is_forgotten_hears_no_frame(rig: Rig) -> None:
+    other = Listener()
+    rig.wire.listen(0x282, other, other.take)
+    rig.wire.forget(rig.listener)
+    for identifier in (0x281, 0x282):
+        rig.far.send(identifier, b"\1\2\3\4")
+    rig.wire.receive(7.0)
+    assert rig.listener.heard == []
+    assert other.heard == [(b"\1\2\3\4", 7.0)]
+
+
 def test_a_frame_of_wrong_length_is_told_to_whose_it_is(rig: Rig) -> None:
     rig.far.send(0x281, bytes(5))
     rig.wire.receive(0.0)

@@ -80,6 +80,11 @@ class Wire:
         self._handlers[can_id] = listener, handler
         self._frames.set_identifiers(self._handlers)
 
+    def forget(self, listener: Listener) -> None:
+        """Remove the handlers of a drive, whose frames may have new identifiers."""
+        self._handlers = {can_id: entry for can_id, entry in self._handlers.items() if entry[0] is not listener}
+        self._frames.set_identifiers(self._handlers)
+
     def begin(self, now: float, *, stopping: bool = False) -> None:
         """Begin a cycle, and continue the reopening of a lost bus.
 

@@ -326,10 +326,13 @@ class Cia402Axis(Axis):
         return PowerState.SWITCHED_ON if waits and self.state is PowerState.OPERATION_ENABLED else self.state
 
     def on_emergency(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """Handle an EMCY, which contains an error code; codes 00xxh report that errors have ended (CiA 301)."""
+        """Handle an EMCY, which contains an error code; codes 00xxh report that an error has ended (CiA 301).
+
+        Other errors persist as long as the error register is not 0.
+        """
         code, register, _ = canopen_frames.EMERGENCY.unpack(data)
         if code & 0xFF00 == 0:
-            self.error_code = 0
+            self.error_code = self.error_code if register else 0
             return
         self.error_code = code
         self.note_fault("emcy", code, f"emergency {describe_error(code, f', error register 0x{register:02X}')}")

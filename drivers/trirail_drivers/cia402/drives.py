@@ -169,6 +169,8 @@ class Cia402(Driver[Cia402Axis]):
         self._prepare_frames()
 
     def _listen(self, axis: Cia402Axis) -> None:
+        """Set the handlers for the frames of a drive."""
+        self._wire.forget(axis)
         listen, exchange = self._wire.listen, axis.exchange
         listen(exchange.feedback.identifier, axis, axis.on_position)
         if exchange.status is not None:

@@ -174,24 +174,27 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
 async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool) -> None:
     """Wait until the node answers, at most for the longest boot time, and check that it is a CiA 402 drive.
 
-    The request is repeated after each time-out and each boot-up message. With `to_pre_operational`, the node is
+    The request is repeated after each time-out and, for twice the longest boot time, after each boot-up message. With `to_pre_operational`, the node is
     switched to NMT pre-operational before each repetition.
     """
     client = remote.client
-    begun = client.clock()
+    begun, longest = client.clock(), BOOT_TIMEOUTS * client.timeout
+    awaited = "answer for object 1000:00 (Device type)"
     while True:
         try:
             device_type = await remote.read(0x1000)
             break
         except DriveTimeout as error:
             waited = client.clock() - begun
-            if waited >= BOOT_TIMEOUTS * client.timeout:
-                raise DriveAbsentError(remote.name, "answer for object 1000:00 (Device type)", waited) from error
+            if waited >= longest:
+                raise DriveAbsentError(remote.name, awaited, waited) from error
             if remote.logs and not remote.boots:
                 LOG.warning("waiting for drive %s to boot", remote.name)
             remote.boots = True
-        except RestartedError:
-            pass
+        except RestartedError as error:
+            waited = client.clock() - begun
+            if waited >= 2 * longest:  # the drive may finish booting just before the end of the longest boot time
+                raise DriveAbsentError(remote.name, f"{awaited}, only boot-up messages,", waited) from error
         if to_pre_operational:
             send_in_setup(client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
     remote.boots = False

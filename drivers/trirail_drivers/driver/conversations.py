@@ -10,6 +10,7 @@ from typing import Any, Final, Generic, TypeVar
 
 import can
 
+from trirail_drivers.bus import canerrors
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import Clock
 
@@ -132,10 +133,16 @@ class BackgroundConversation(Generic[T]):
 
 
 def _receive(bus: can.BusABC, seconds: float) -> can.Message | None:
+    """Return a received frame, or None after some time. Raises BusError if the bus is lost."""
     try:
-        return bus.recv(max(0.0, seconds))
+        frame = bus.recv(max(0.0, seconds))
     except (can.CanError, OSError) as error:
         raise BusError(f"cannot receive on {bus.channel_info}: {error}; check that the interface is up") from error
+    if frame is not None and frame.is_error_frame:
+        report = canerrors.decode_error_frame(frame.arbitration_id, frame.data)
+        if report.severity is canerrors.Severity.FAULT:
+            raise BusError(f"cannot use {bus.channel_info}: {report.text}")
+    return frame
 
 
 async def read_until(
