@@ -47,6 +47,29 @@ def test_a_statusword_that_may_be_held_back_is_taken_from_beside_the_position(cl
     rig.enable()
 
 
+@pytest.mark.parametrize(
+    ("timers", "polled"), [((100, 0), True), ((0, 100), False), ((0, 20), False), ((0, 500), True)]
+)
+def test_a_statusword_in_a_fixed_tpdo_is_polled_unless_that_tpdo_repeats_it(
+    closing: Closing, timers: tuple[int, int], polled: bool
+) -> None:
+    first, third = timers
+    mapped = {(0x1A00, 0): 1, (0x1A00, 1): 0x60FD_0020, (0x1A02, 0): 1, (0x1A02, 1): 0x6041_0010}
+    timed = {(0x1800, 5): first, (0x1802, 1): 0x381, (0x1802, 2): 255, (0x1802, 5): third}
+    fixed = dict.fromkeys([(0x1800, 1), (0x1800, 5), (0x1802, 5), *mapped], "ro")
+    rig = closing(Rig("elmo_gold", Habits(values=mapped | timed, access=fixed)))
+    rig.ready()
+    for axis in rig.drives._axes:
+        assert (axis.exchange.status, axis.exchange.polled) == (0x380 + axis.node, polled)
+
+
+@pytest.mark.parametrize(("held", "wanted"), [(0, 0), (20, 20), (100, 100), (101, 100), (65535, 100)])
+def test_a_drive_reacts_soon_to_a_following_error(closing: Closing, held: int, wanted: int) -> None:
+    rig = closing(Rig("elmo_gold", Habits(values={(0x6066, 0): held})))
+    rig.ready()
+    assert [node.value(0x6066) for node in rig.nodes] == [wanted] * 3
+
+
 def test_a_fixed_mapping_that_does_not_fit_is_refused_by_its_object(closing: Closing) -> None:
     rig = closing(Rig("elmo_gold", Habits(fixed_pdos=True, values=FIXED)))
     with pytest.raises(DriveError, match=r"drive A: object 1601 .*no PDO fits setpoints 607A: it has 1601 = 60FF0020h"):

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 
 import pytest
-from drivers.foreign import ENABLED, Habits
+from drivers.foreign import ENABLED, REACTION, Habits
 from drivers.slow import Slowness, SlowWires, three_slow
 from drivers.test_foreign import COUNTS, MAKES, PERIOD, Rig
 from hypothesis import given, settings
@@ -77,6 +77,18 @@ def test_a_brake_may_take_as_long_as_any_stop(brake: float, said: str) -> None:
     for node in rig.nodes:
         node.state = ENABLED
     assert re.search(said, refusal(rig))
+
+
+@pytest.mark.parametrize(("takes", "said"), [(0.1, ""), (0.9, ""), (5.0, "did not power off .* 1 s ")])
+def test_a_drive_that_reacts_to_a_fault_is_configured_when_it_has_stopped(takes: float, said: str) -> None:
+    rig = SlowRig("elmo_gold", lambda _: Slowness())
+    node = rig.wires.slow[1]
+    node.state, node.servo.velocity = REACTION, 1.0
+    node.servo.brake = lambda *_: None  # type: ignore[method-assign]
+    node._later(takes, lambda: setattr(node.servo, "velocity", 0.0))
+    before = rig.clock.now
+    assert re.search(said, refusal(rig))
+    assert rig.clock.now - before >= min(takes, 1.0)
 
 
 def test_drives_that_boot_later_are_waited_for_and_that_is_told(

@@ -63,6 +63,7 @@ USES: Final = {
     "6061": ObjectUse(_N, "Modes of operation display", "the mode", "refused"),
     "6064": ObjectUse(_N, "Position actual value", "its position", "refused"),
     "6065": ObjectUse(_P, "Following error window", "its own monitoring of the following error", "only this service's"),
+    "6066": ObjectUse(_R, "Following error time out", "a prompt reaction to a following error", "its own time"),
     "607A": ObjectUse(_N, "Target position", "setpoints of mode 8", "refused"),
     "607C": ObjectUse(_R, "Home offset", "home at `offset`", "0, the standard's default"),
     "6085": ObjectUse(_P, "Quick stop deceleration", "its quick-stop ramp", "its own ramp"),
@@ -96,12 +97,12 @@ PROTECTIONS: Final = {name: used for name, used in USES.items() if used.need is 
 _WIDTHS: Final = {
     **dict.fromkeys((0x1001, 0x1019, 0x1029, 0x6060, 0x6061, 0x6098, 0x60C2), 1),
     **dict.fromkeys((0x100C, 0x1015, 0x1017, 0x603F, 0x6040, 0x6041), 2),
-    **dict.fromkeys((0x6007, 0x605A, 0x605E, 0x60C0), 2),
+    **dict.fromkeys((0x6007, 0x605A, 0x605E, 0x6066, 0x60B2, 0x60C0), 2),
     0x100D: 1,
 }
 """Size of each object's value [bytes] if it is not four (CiA 301, CiA 402-2)."""
 _SIGNED: Final = frozenset(
-    (0x6007, 0x605A, 0x605E, 0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x6098, 0x60B1, 0x60C0, 0x60C1)
+    (0x6007, 0x605A, 0x605E, 0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x6098, 0x60B0, 0x60B1, 0x60B2, 0x60C0, 0x60C1)
 )
 
 

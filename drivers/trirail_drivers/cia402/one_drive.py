@@ -32,6 +32,7 @@ from trirail_drivers.interface import PowerState
 
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which current may flow in a drive's motor."""
+_POWERED = (*HAS_POWER, PowerState.FAULT_REACTION_ACTIVE)
 
 BOOT_TIMEOUTS: Final = 10
 """Longest boot time of a drive, as a multiple of `sdo_timeout`."""
@@ -174,8 +175,8 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
 async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool) -> None:
     """Wait until the node answers, at most for the longest boot time, and check that it is a CiA 402 drive.
 
-    The request is repeated after each time-out and, for twice the longest boot time, after each boot-up message. With `to_pre_operational`, the node is
-    switched to NMT pre-operational before each repetition.
+    The request is repeated after each time-out and, for twice the longest boot time, after each boot-up message. With
+    `to_pre_operational`, the node is switched to NMT pre-operational before each repetition.
     """
     client = remote.client
     begun, longest = client.clock(), BOOT_TIMEOUTS * client.timeout
@@ -209,10 +210,10 @@ async def _switch_off(remote: Remote, seconds: float) -> None:
     """Remove a drive's power, and wait until its state shows that, since a brake needs time to close."""
     await remote.write(0x6040, 0, canopen_frames.DISABLE_VOLTAGE)
     statusword, waited = await remote.wait_until(
-        (0x6041, 0), lambda statusword: canopen_frames.power_state(statusword) not in HAS_POWER, seconds
+        (0x6041, 0), lambda statusword: canopen_frames.power_state(statusword) not in _POWERED, seconds
     )
     statusword = await remote.read(0x6041) if statusword is None else statusword
-    if not remote.rehearsed and canopen_frames.power_state(statusword) in HAS_POWER:
+    if not remote.rehearsed and canopen_frames.power_state(statusword) in _POWERED:
         raise DriveError(f"drive {remote.name}: did not power off within {waited:.3g} s (statusword {statusword:04X})")
 
 

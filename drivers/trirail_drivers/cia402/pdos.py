@@ -201,8 +201,7 @@ class Pdos:
                     f"{title((0x1800, 5))}: it has none that can be used; its statusword comes with the position"
                 )
             return chosen, None, False, False
-        status, beside = await self._status(inputs=inputs)
-        polled = status is None or not await self._timer()
+        status, polled, beside = await self._status(inputs=inputs)
         if polled:
             self._drive.add_note(f"its statusword is also requested by SDO, every {canopen_frames.POLL_PERIOD:g} s")
         return chosen, status, polled, beside
@@ -396,25 +395,29 @@ class Pdos:
 
     # ------------------------------------------------------------------ the statusword
 
-    async def _status(self, *, inputs: bool) -> tuple[int | None, bool]:
+    async def _status(self, *, inputs: bool) -> tuple[int | None, bool, bool]:
         """Set up the TPDO of the statusword, and of the inputs if they are wanted and fit into the same TPDO.
 
-        Return the identifier of the TPDO, or None, and whether the TPDO contains the inputs.
+        Return the identifier of the TPDO, or None; whether the statusword must be polled; and whether the TPDO contains
+        the inputs.
         """
         number = canopen_frames.TPDO1 + self._node
         if inputs:
             identifier = await self._map(TPDO, number, ON_CHANGE, (STATUSWORD, DIGITAL_INPUTS))
             if identifier is not None:
-                return identifier, True
+                return identifier, not await self._is_repeated(TPDO), True
         identifier = await self._map(TPDO, number, ON_CHANGE, (STATUSWORD,))
         if identifier is not None:
-            return identifier, False
+            return identifier, not await self._is_repeated(TPDO), False
         pdo = await self._first_fixed(TPDO, (STATUSWORD,), ON_CHANGE)
-        return (None if pdo is None else pdo.identifier), False
+        if pdo is None:
+            return None, True, False
+        return pdo.identifier, not await self._is_repeated(pdo.at), False
 
-    async def _timer(self) -> bool:
-        """Whether the drive repeats its statusword periodically."""
-        return await self._remote.peek(TPDO, 5) == round(1000 * canopen_frames.STATUS_PERIOD)
+    async def _is_repeated(self, index: int) -> bool:
+        """Whether the drive sends the statusword's TPDO periodically, often enough."""
+        period_ms = await self._remote.peek(index, 5)
+        return bool(period_ms) and period_ms <= round(1000 * canopen_frames.STATUS_PERIOD)
 
     async def _can_be_prompt(self, index: int) -> bool:
         """Whether the inhibit time is 0 or can be set to 0. With another inhibit time, a statusword may be delayed."""

@@ -122,8 +122,12 @@ def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
     return f"; it holds {1000 * period:g} ms: set loop.rate_hz = {1 / period:g}"
 
 
+MAX_FOLLOWING_TIMEOUT_MS: Final = 100
+"""Maximum time for which a following error may exceed its window before the drive reacts [ms]."""
+
+
 async def configure_reactions(drive: Differences, drives: Drives, units: Units) -> None:
-    """Configure the drive's reactions to faults: 6007h, 605Ah, 605Eh, 6065h, 6085h."""
+    """Configure the drive's reactions to faults: 6007h, 605Ah, 605Eh, 6065h, 6066h, 6085h."""
     name = drive.remote.name
     # 6007h = 3: a drive without its master makes a quick stop. Removing power (2) or a fault (1) is also accepted.
     await drive.ensure(0x6007, 0, 3, also=(2, 1))
@@ -136,6 +140,8 @@ async def configure_reactions(drive: Differences, drives: Drives, units: Units) 
     else:
         drive.lack((0x6085, 0), "it has no such object")
     await drive.ensure(0x6065, 0, units.length(name, "following_error", drives.following_error))
+    if (await drive.remote.peek(0x6066) or 0) > MAX_FOLLOWING_TIMEOUT_MS:
+        await drive.ensure(0x6066, 0, MAX_FOLLOWING_TIMEOUT_MS)
 
 
 async def configure_homing(drive: Differences, homing: Homing, units: Units) -> None:

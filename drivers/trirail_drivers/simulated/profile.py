@@ -76,7 +76,10 @@ _WINDOW_OFF: Final = 0xFFFFFFFF
 
 
 class Profile:
-    """CiA 402 objects of a drive. Missing objects have defaults: 6007h is 0, 605Ah is 2, 6065h is off, 60B0h and 60B1h are 0."""
+    """CiA 402 objects of a drive.
+
+    Missing objects have defaults: 6007h is 0, 605Ah is 2, 6065h is off, 60B0h and 60B1h are 0.
+    """
 
     def __init__(self, objects: Dictionary, mechanics: Mechanics, mode_changed: Callable[[], None]) -> None:
         self._mode_changed = mode_changed
