@@ -284,6 +284,30 @@ def test_an_answer_against_the_rules_is_not_told_as_silence(closing: Closing, mo
     assert not isinstance(told.value, DriveTimeout)
 
 
+def test_a_segment_that_is_not_answered_is_aborted_by_its_object(
+    closing: Closing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = closing(Rig("elmo_gold"))
+    served, sent = rig.nodes[0].local.sdo, list[bytes]()
+    answer: Callable[[bytes], None] = served.send_response
+    send = rig.wires.send
+
+    def begun(data: bytes) -> None:
+        if data[0] == 0x43:
+            answer(b"\x41\x00\x10\x00\x04\0\0\0")
+
+    def recorded(message: can.Message, timeout: float | None = None) -> None:
+        sent.append(bytes(message.data))
+        send(message, timeout)
+
+    monkeypatch.setattr(served, "send_response", begun)
+    monkeypatch.setattr(rig.wires, "send", recorded)
+    with pytest.raises(DriveTimeout):
+        rig.ready()
+    aborts = {data for data in sent if len(data) == 8 and data[0] == 0x80}
+    assert aborts == {bytes.fromhex("80 00 10 00 00 00 04 05")}
+
+
 LACKABLE = [name for name in PROTECTIONS if name not in ("1016", FOLLOWING_BIT)]
 """Protections whose place nothing takes; for 1016 there is guarding."""
 

@@ -63,7 +63,6 @@ USES: Final = {
     "6061": ObjectUse(_N, "Modes of operation display", "the mode", "refused"),
     "6064": ObjectUse(_N, "Position actual value", "its position", "refused"),
     "6065": ObjectUse(_P, "Following error window", "its own monitoring of the following error", "only this service's"),
-    "6066": ObjectUse(_R, "Following error time out", "a prompt reaction to a following error", "its own time"),
     "607A": ObjectUse(_N, "Target position", "setpoints of mode 8", "refused"),
     "607C": ObjectUse(_R, "Home offset", "home at `offset`", "0, the standard's default"),
     "6085": ObjectUse(_P, "Quick stop deceleration", "its quick-stop ramp", "its own ramp"),

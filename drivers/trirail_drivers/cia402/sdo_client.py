@@ -12,6 +12,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.frames import Frame, FrameSender
 from trirail_drivers.cia402 import canopen_frames, duplicate_node
+from trirail_drivers.cia402.objects import Key
 from trirail_drivers.driver.conversations import Wait
 from trirail_drivers.interface import Clock
 
@@ -92,7 +93,7 @@ class Client:
             return answer[4 : 8 - unused]
         content, toggle = b"", 0
         while True:
-            answer = await self._request(bytes([_UPLOAD_SEGMENT << 5 | toggle, *bytes(7)]))
+            answer = await self._request(bytes([_UPLOAD_SEGMENT << 5 | toggle, *bytes(7)]), (index, subindex))
             if answer[0] & _TOGGLE != toggle:
                 self._abort(index, subindex, code=_NOT_ALTERNATED)
                 raise SdoCommunicationError("Toggle bit mismatch")
@@ -113,7 +114,7 @@ class Client:
             piece = data[at : at + 7]
             last = _LAST * (at + 7 >= len(data))
             first = _DOWNLOAD_SEGMENT << 5 | toggle | (7 - len(piece)) << 1 | last
-            await self._request(struct.pack("<B7s", first, piece))
+            await self._request(struct.pack("<B7s", first, piece), (index, subindex))
             toggle ^= _TOGGLE
 
     async def try_download(self, index: int, subindex: int, size: int) -> None:
@@ -134,7 +135,8 @@ class Client:
         # An abort has no answer, and the next request could overwrite it in a drive that buffers only one frame.
         await self.pause(ABORT_PAUSE_S)
 
-    async def _request(self, request: bytes) -> bytes:
+    async def _request(self, request: bytes, key: Key | None = None) -> bytes:
+        """Send a request, and return the answer. `key` is the object of a segment, which does not contain it."""
         self._check_booted()
         self._asked = request
         self._send(request)
@@ -143,7 +145,8 @@ class Client:
         if self._again >= MAX_SECOND_ANSWERS:
             raise TwoNodesError(self.node)
         if frame is None:
-            self._abort(*struct.unpack_from("<HB", request, 1), code=_TIMED_OUT)
+            index, subindex = key or struct.unpack_from("<HB", request, 1)
+            self._abort(index, subindex, code=_TIMED_OUT)
             raise NoAnswerError("no answer")
         self.observe(frame)
         self._check_booted()

@@ -140,8 +140,9 @@ async def configure_reactions(drive: Differences, drives: Drives, units: Units) 
     else:
         drive.lack((0x6085, 0), "it has no such object")
     await drive.ensure(0x6065, 0, units.length(name, "following_error", drives.following_error))
-    if (await drive.remote.peek(0x6066) or 0) > MAX_FOLLOWING_TIMEOUT_MS:
-        await drive.ensure(0x6066, 0, MAX_FOLLOWING_TIMEOUT_MS)
+    held = await drive.remote.peek(0x6066)
+    if held is not None and held > MAX_FOLLOWING_TIMEOUT_MS:
+        await drive.put((0x6066, 0), held, MAX_FOLLOWING_TIMEOUT_MS, "a prompt reaction to a following error")
 
 
 async def configure_homing(drive: Differences, homing: Homing, units: Units) -> None:
