@@ -11,6 +11,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
+from trirail.errors import RefusalCode, RefusedError
+from trirail.motion.goal_planner import GoalPlanner
+from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import (
     Goal,
@@ -32,6 +35,11 @@ PROMPT = round(0.05 / PERIOD)
 
 def answer_to(rig: ControlRig, ticket: int) -> Answer | None:
     return next((answer for answer in rig.answers if getattr(answer, "ticket", None) == ticket), None)
+
+
+def refuse(*_: object) -> None:
+    """Find no path."""
+    raise RefusedError(RefusalCode.NO_PLAN, "no path")
 
 
 def confirmed_after(rig: ControlRig, name: str, within: int) -> int:
@@ -280,18 +288,44 @@ def test_a_goal_sent_twice_and_then_paused_goes_on_when_it_is_resumed_and_ends_o
     assert rig.outcomes() == [("g2", "stopped"), ("g1", "done")]
 
 
-def test_a_disable_is_answered_though_the_robot_is_enabled_again_at_once(rig: ControlRig) -> None:
+def test_drives_that_still_have_power_are_not_enabled_again(rig: ControlRig) -> None:
+    """Their statuswords would be those from before they were disabled."""
     rig.enable()
     rig.goal("g1", 0.05, 0.0, 0.0)
     rig.cycles(100)
     rig.cycle(CommandRequest(98, "ann", Command.DISABLE, carried("disable")))
     rig.until(lambda: rig.mode is Mode.DISABLED)
-    rig.cycle(CommandRequest(99, "ann", Command.ENABLE, carried("enable")))
-    rig.cycles(20)
+    assert rig.control.measured.powered
+    refused = rig.command("enable")
+    assert isinstance(refused, Refused)
+    assert (refused.code, refused.message[:29]) == (RefusalCode.STOPPING, "drive A is operation enabled,")
+    rig.until(lambda: not rig.control.measured.powered)
+    assert isinstance(answer_to(rig, 98), CommandDone)
+    assert isinstance(rig.command("enable"), CommandDone)
     assert rig.holds()
-    assert isinstance(answer_to(rig, 98), Refused)
-    assert isinstance(answer_to(rig, 99), CommandDone)
     assert not rig.control.ledger.busy
+
+
+def test_a_pause_brakes_also_where_a_goal_waits_for_the_end_of_the_old_motion(
+    rig: ControlRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a path from the motion nor a law that stops it is found. The path of the goal begins at its end."""
+    rig.enable()
+    rig.goal("g1", -0.12, 0.0, 0.0)
+    rig.cycles(150)
+    with monkeypatch.context() as patch:
+        patch.setattr(GoalPlanner, "_plan_from_motion", refuse)
+        patch.setattr(TimeScaling, "stop", lambda *_: None)
+        accepted = rig.goal("g2", 0.0, 0.03, 0.0)
+    assert isinstance(accepted, Accepted)
+    assert accepted.reply.stops_first
+    assert len(rig.control.schedule.runs) == 2
+    rig.order("pause")
+    rig.until(lambda: rig.control.commanded.at_rest)
+    assert rig.control.commanded.pose[0] > -0.11
+    rig.until(rig.holds)
+    assert dict(rig.outcomes()) == {"g1": "preempted", "g2": "stopped"}
+    assert isinstance(rig.command("resume"), Refused)
 
 
 @pytest.mark.parametrize("wait", [0, 3, 10, 30])

@@ -417,7 +417,7 @@ class Pdos:
     async def _is_repeated(self, index: int) -> bool:
         """Whether the drive sends the statusword's TPDO periodically, often enough."""
         period_ms = await self._remote.peek(index, 5)
-        return bool(period_ms) and period_ms <= round(1000 * canopen_frames.STATUS_PERIOD)
+        return period_ms is not None and 0 < period_ms <= round(1000 * canopen_frames.STATUS_PERIOD)
 
     async def _can_be_prompt(self, index: int) -> bool:
         """Whether the inhibit time is 0 or can be set to 0. With another inhibit time, a statusword may be delayed."""

@@ -99,9 +99,14 @@ def _timed_out(now: CommandProgress) -> str:
 
 def powered_message(measured: MeasuredState, latched: str | None) -> str:
     """Return the refusal of a reset that is sent while drives can still move. The message names these drives."""
+    return f"{_powered_drives(measured)}: send reset again when the drives are at rest (fault: {latched})"
+
+
+def _powered_drives(measured: MeasuredState) -> str:
+    """Return the names and states of the drives that can still move."""
     states = zip(NAMES, measured.feedback.state, strict=True)
     drives = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
-    return f"{drives} according to the last statusword: send reset again when the drives are at rest (fault: {latched})"
+    return f"{drives} according to the last statusword"
 
 
 SETTLE = 0.1
@@ -156,9 +161,12 @@ class Commands:
         event, reason = ModeEvent[request.name.name], _reason(request)
         action = self._modes.check(event).action
         goal = self._ledger.goal
-        if event is ModeEvent.PAUSE and goal is not None and goal.kind.renewed:
+        if event is ModeEvent.PAUSE and ((goal is not None and goal.kind.renewed) or self._planner.needs_old_motion):
             # Jogs and tracks cannot be resumed: the key of a jog has been released, the target of a track has moved on.
             event = ModeEvent.STOP
+        if action is Action.POWER_UP and self._measured.powered:
+            words = f"{_powered_drives(self._measured)}: send enable again when no drive has power"
+            raise RefusedError(RefusalCode.STOPPING, words)
         if action is Action.POWER_UP:
             self._setpoints.check_rest()
             if self._measured.homed and (outside := self._setpoints.check_start()) is not None:

@@ -170,6 +170,15 @@ class PlanRequests:
         """Stop planning the goal, and ignore answers that arrive later."""
         self._goal = self._request = self._answer = self._planned_run = self._lost = self._since = None
 
+    @property
+    def needs_old_motion(self) -> bool:
+        """Whether the current goal begins only after the old motion has run to its end, because it cannot stop sooner.
+
+        A pause would not brake the old motion, since the goal's path begins at its end.
+        """
+        runs = self._schedule.runs
+        return len(runs) > 1 and runs[0].target != 0.0
+
     def set_running(self, running: bool) -> None:
         """Run the current motion at the speed override, or brake to a standstill."""
         self._running = running
