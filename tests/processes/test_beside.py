@@ -105,7 +105,7 @@ def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last
 ) -> None:
     config = CONFIGS.get(protocol, CONFIGS["cia402"])
     session = Session(config, tmp_path, "unix", quiet=True)
-    quiet_of(session).beside = number, number
+    quiet_of(session).cycles_beside = number, number
     generate = {"two": requests_of_two, "stops": stops_first}.get(protocol)
     happens = generate(seed) if generate is not None else script(seed, protocol)
     try:
@@ -133,7 +133,7 @@ def test_cycles_beside_a_decision_are_recorded_at_a_rate_at_which_a_batch_has_fe
     config = CONFIGS["cia402"]
     config = structs.replace(config, loop=structs.replace(config.loop, rate_hz=rate))
     session = Session(config, tmp_path, "unix", quiet=True)
-    quiet_of(session).beside = number, number
+    quiet_of(session).cycles_beside = number, number
     try:
         records, inputs, events = recorded(session, script(3), CYCLES)
     finally:
@@ -182,7 +182,7 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
     config, chance = CONFIGS["cia402"], random.Random(seed)
     session = Session(config, tmp_path, "unix", quiet=True)
     quiet = quiet_of(session)
-    quiet.beside = number, number
+    quiet.cycles_beside = number, number
     run_beside, happened, began = quiet.run_beside, [], []
 
     def ambushed(*arguments: Any) -> Any:
@@ -226,7 +226,7 @@ def test_a_quick_stop_in_the_second_cycle_beside_a_decision_is_handled_in_it(tmp
     """The first of these cycles needs Python, so that Python runs the second as well."""
     session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
     quiet = quiet_of(session)
-    quiet.beside = 2, 2
+    quiet.cycles_beside = 2, 2
     run_beside, record = quiet.run_beside, quiet.record
     asked: list[int] = []
 
@@ -319,7 +319,7 @@ def test_what_must_not_wait_does_not_although_a_decision_is_due_in_every_cycle(
     seed: int, number: int, what: str, tmp_path: Path
 ) -> None:
     session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
-    quiet_of(session).beside = 1, number
+    quiet_of(session).cycles_beside = 1, number
     began: list[int] = []
 
     def happens(session: Session) -> None:
@@ -345,7 +345,7 @@ def test_a_frozen_gateway_is_noticed_although_decisions_are_made_in_every_cycle(
         folder = tmp_path / str(beside[0])
         folder.mkdir()
         session = Session(CONFIGS["cia402"], folder, "unix", quiet=True)
-        quiet_of(session).beside = beside
+        quiet_of(session).cycles_beside = beside
         happens = {
             30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
             100: [Happening(lambda session: session.ask(goal))],
@@ -391,7 +391,7 @@ def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
     config = structs.replace(CONFIGS["cia402"], inputs=INPUTS)
     session = Session(config, tmp_path, "unix", quiet=True)
     quiet = quiet_of(session)
-    quiet.beside = number, number
+    quiet.cycles_beside = number, number
     run_beside = quiet.run_beside
     pressed: list[tuple[int, bool]] = []
 
@@ -433,7 +433,7 @@ def test_an_edge_from_before_the_start_of_a_goal_does_not_end_it(tmp_path: Path)
     config = structs.replace(CONFIGS["cia402"], inputs=INPUTS)
     session = Session(config, tmp_path, "unix", quiet=True)
     quiet = quiet_of(session)
-    quiet.beside = 2, 2
+    quiet.cycles_beside = 2, 2
     decide = quiet._answer
 
     def press_at_start() -> None:
@@ -464,7 +464,7 @@ def test_an_edge_from_before_the_start_of_a_goal_does_not_end_it(tmp_path: Path)
 @pytest.mark.generated(4125785050, 0, 1, 2, 3)
 def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: int, tmp_path: Path) -> None:
     session = Session(PINS, tmp_path, "unix", quiet=True)
-    quiet_of(session).beside = number, number
+    quiet_of(session).cycles_beside = number, number
     try:
         records, inputs, events = recorded(session, session_with_outputs(seed), OUTPUT_CYCLES)
     finally:
@@ -486,7 +486,7 @@ def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: in
 def test_a_warning_of_the_bus_beside_a_decision_is_reported(tmp_path: Path) -> None:
     session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
     quiet = quiet_of(session)
-    quiet.beside = 2, 2
+    quiet.cycles_beside = 2, 2
     run_beside, began = quiet.run_beside, []
 
     def ambushed(*arguments: Any) -> Any:
@@ -542,7 +542,7 @@ def test_a_path_ends_in_the_same_cycle_as_without_cycles_beside_decisions(seed: 
         folder = tmp_path / "-".join(map(str, beside))
         folder.mkdir()
         session = Session(CONFIGS["cia402"], folder, "unix", quiet=True)
-        quiet_of(session).beside = beside
+        quiet_of(session).cycles_beside = beside
         if beside == (0, 2):
             budget = session.loop._decision_budget
             budget.note = lambda _, budget=budget: setattr(budget, "ns", chance.randrange(2_000_000))  # type: ignore[method-assign, misc]

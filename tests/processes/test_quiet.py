@@ -384,7 +384,7 @@ def both_ways(
         place.mkdir()
         session = Session(config, place, carrier, quiet=quiet)
         if session.loop._quiet is not None:
-            session.loop._quiet.beside = 0, 0  # Python's cycles know no cycles beside a decision
+            session.loop._quiet.cycles_beside = 0, 0  # Python's cycles know no cycles beside a decision
         try:
             session.run(script(), cycles)
         finally:

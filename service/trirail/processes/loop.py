@@ -116,8 +116,8 @@ class Loop:
         self._decision_budget = TimeBudget(DECISION_BUDGET_NS, MOST_AHEAD * self._period_ns)
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
-            beside = self._reports, heartbeats, ports.gateway, PollSet(ports), watch, self._urgent_flag
-            self._quiet = QuietCycles(self.control, drives, *beside, config.loop.busy_wait_ns, self._decide_ahead)
+            shared = self._reports, heartbeats, ports.gateway, PollSet(ports), watch, self._urgent_flag
+            self._quiet = QuietCycles(self.control, drives, *shared, config.loop.busy_wait_ns, self._decide_ahead)
         self._decided_after = 0
         """Cycle after which the newest decision has taken effect."""
         self._fault: DriveFault | None = None

@@ -248,7 +248,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
     s.lateness_ns = now - s.deadline_ns
     s.missed = max(0, s.lateness_ns // s.period_ns)
     t = now / 1e9
-    if (s.in_a_row + s.missed > s.allowed and not s.beside) or t >= times[0].due:
+    if (s.in_a_row + s.missed > s.allowed and not s.deciding) or t >= times[0].due:
         return Reached.WAITED
     s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
     s.synced, s.handled, s.arrived = t, 0, 0
@@ -280,7 +280,7 @@ def _read(
     count = hearts[s.gateway_place]  # the same check as in trirail.processes.heartbeats.Watch
     turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
     lost = pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience
-    if hearts[URGENT_INDEX] != s.urgent_seen or (lost and not s.beside):
+    if hearts[URGENT_INDEX] != s.urgent_seen or (lost and not s.deciding):
         return Reached.SYNCED
     t = _now_ns(state, moment) / 1e9
     if not (_receive(s, moment, frames, t) and end_read(axes, frames.times, frames.history, t)):
@@ -464,7 +464,7 @@ def _request_decision(
     s, number = state[0], _cycles_beside(state, moment, neighbours, motion, tables)
     if number == 0:
         return False
-    s.beside, s.until = True, s.cycle + number
+    s.deciding, s.until = True, s.cycle + number
     s.requested, s.requested_deadline_ns, s.requested_called, s.requested_time = (
         s.cycle,
         s.deadline_ns,
@@ -525,7 +525,7 @@ def _run_cycles(
     """Run cycles until Python is needed; return the stage that the newest cycle has reached."""
     s = state[0]
     while s.cycle < s.until and s.batched < len(neighbours.batch):
-        if s.most > 0 and not s.beside:
+        if s.most > 0 and not s.deciding:
             s.decides = s.cycle >= min(s.due, s.ends) - s.lead
             s.called = _await_call(state, moment, neighbours)
             if s.called or s.decides:
@@ -535,7 +535,7 @@ def _run_cycles(
         reached = _run_cycle(state, moment, neighbours, frames, robot, motion, tables)
         if reached != CONTINUE:
             return reached
-        if (s.called or s.decides) and not s.beside:
+        if (s.called or s.decides) and not s.deciding:
             requested = _request_decision(state, moment, neighbours, motion, tables, copies)
             if not requested or s.injected_ns >= 0:
                 return Reached.DONE
@@ -569,10 +569,10 @@ def run(
 
     """
     s = state[0]
-    if not s.beside:
+    if not s.deciding:
         copy_state(copies, False)
         s.ends = _next_end(s, motion, s.cycle, s.code)
     reached = _run_cycles(state, moment, neighbours, frames, robot, motion, tables, copies)
-    if not s.beside:
+    if not s.deciding:
         copy_state(copies, True)
     return reached

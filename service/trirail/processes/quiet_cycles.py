@@ -146,7 +146,7 @@ class QuietCycles:
         self._nothing = np.zeros(1)
         self._decide = decide
         self._companion = Companion(self._answer)
-        self.beside = 1, quiet.MOST_AHEAD
+        self.cycles_beside = 1, quiet.MOST_AHEAD
         """Minimum and maximum number of cycles that run beside a decision, which tests change."""
         measured, setpoints = control.measured, control.setpoints
         self._measured, self._commanded, self._furthest = _Copies(), _Copies(), _Copies()
@@ -194,10 +194,10 @@ class QuietCycles:
             return None
         state.injected_ns = ticker.sleep_if_injected()
         state.until = control.cycles + (1 if state.injected_ns >= 0 else max(1, self._reports.due_after))
-        state.beside, state.requested = False, -1
+        state.deciding, state.requested = False, -1
         state.logged, state.report_due = control.outputs.logged, control.outputs.report_due
         state.budget_ns = budget_ns
-        state.least, state.most = self.beside if self._runs_beside else (0, 0)
+        state.least, state.most = self.cycles_beside if self._may_decide_beside else (0, 0)
         state.lead = min(max(state.least, -(-budget_ns // state.period_ns) - 1), state.most)
         self._poll_set.refresh()
         reached = self._call_beside(work, ticker, overruns)
@@ -316,7 +316,7 @@ class QuietCycles:
         return number
 
     @property
-    def _runs_beside(self) -> bool:
+    def _may_decide_beside(self) -> bool:
         """True if Python may decide beside the next cycles.
 
         They then execute a motion or hold the robot. Compiled code must not need Python to exchange frames.

@@ -111,7 +111,7 @@ class QuietState(ctypes.Structure):
     """Time that a decision beside the cycles needs, from the request until its result can be used."""
     doorbell: int
     """Descriptor of the eventfd that wakes up the thread which decides beside the cycles."""
-    beside: bool
+    deciding: bool
     """Whether Python decides beside the cycles, so that calls, other decisions and a lost gateway wait."""
     requested: int
     """Cycle after which a decision beside the next cycles, up to `until`, was requested; -1 if none was requested."""
