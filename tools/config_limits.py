@@ -77,9 +77,10 @@ BOUNDS = (
     Bound("Renewal of a jog", (), "the robot brakes, `jog_over`"),
     Bound("Renewal of the lease", (), "controlled stop, the lease is free"),
     Bound("A command, in the service", ("trirail.processes.requests:REPLY_TIMEOUT_S s",),
-          "error `timeout`; `home` adds the time-outs of homing"),
+          "error `timeout`; `home` and `enable` add their time-outs"),
     Bound("A command, in the client", ("trirail.client.async_client:REPLY_WITHIN s",
-          "trirail.client.async_client:HOME_WITHIN s"), "`ServiceError`; the longer time is for `home`"),
+          "trirail.client.async_client:HOME_WITHIN s", "trirail.client.async_client:ENABLE_WITHIN s"),
+          "`ServiceError`; the longer times are for `home` and `enable`"),
     Bound("Size of recordings", ("telemetry.rotate_minutes", "telemetry.rotate_mb", "telemetry.keep_mb"),
           "another file starts, the oldest is deleted"),
 )  # fmt: skip

@@ -138,6 +138,23 @@ def test_ctrl_c_while_a_goal_is_sent_stops_it_if_it_was_taken(robot: Robot, slow
     kept.clear()
 
 
+@pytest.mark.generated(*range(6))
+def test_ctrl_c_in_a_program_that_then_closes_its_robot_stops_the_goal_all_the_same(
+    slow: Slow, tmp_path: Path, seed: int
+) -> None:
+    kept: list[zenoh.Query] = []
+
+    def program() -> None:
+        with Robot("demo", f"unixsock-stream/{tmp_path}/zenoh", user="ann") as robot:
+            robot.move_to(0.0, 0.0, 0.0, id=f"g{seed}")
+
+    interrupt(program, lambda: kept.append(slow.next()))
+    with slow.next() as stop:
+        assert stop.payload is not None
+        assert msgspec.json.decode(stop.payload.to_bytes()) == {"goal": f"g{seed}"}
+    kept.clear()
+
+
 def test_ctrl_c_on_the_way_to_the_first_point_of_a_path_stops_the_robot(robot: Robot, slow: Slow) -> None:
     ids: list[str] = []
 

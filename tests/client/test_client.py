@@ -78,6 +78,7 @@ def test_a_call_ends_by_its_timeout_whatever_arrives(
 ) -> None:
     monkeypatch.setattr(async_client, "REPLY_WITHIN", TIMEOUT)
     monkeypatch.setattr(async_client, "HOME_WITHIN", TIMEOUT)
+    monkeypatch.setattr(async_client, "ENABLE_WITHIN", TIMEOUT)
     ended = threading.Event()
     raised: list[type[BaseException] | None] = []
 
@@ -105,6 +106,7 @@ def test_a_service_that_does_not_answer_in_time_is_told_as_that(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(async_client, "REPLY_WITHIN", TIMEOUT)
+    monkeypatch.setattr(async_client, "ENABLE_WITHIN", TIMEOUT)
     locator, mute = f"unixsock-stream/{tmp_path}/zenoh", list[zenoh.Query]()
     with open_service([locator]) as session, session.declare_queryable("trirail/demo/**", mute.append):
         with Robot("demo", locator) as robot:

@@ -12,7 +12,7 @@ import pytest
 from refusals import refused_as
 from trirail.client.blocking import Lease, LoopThread
 from trirail.client.lease import SIGNS, AsyncLease
-from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 from waiting import WITHIN
@@ -111,6 +111,22 @@ def test_a_lease_ends_with_its_time_out_if_the_service_does_not_answer(loop: Loo
         assert isinstance(lease.lost, ServiceError)
 
 
+PASSING = [
+    ServiceError("no robot 'demo' answers"),
+    RefusedError(RefusalCode.BUSY, "64 commands are already in progress"),
+    RefusedError(RefusalCode.TIMEOUT, "the request was not carried out in time"),
+]
+
+
+@pytest.mark.parametrize("error", PASSING)
+def test_a_lease_that_is_never_renewed_is_over_with_its_time_out(loop: LoopThread, error: TrirailError) -> None:
+    service = Service(loop)
+    with service.lease() as lease:
+        service.refusal = error
+        assert lease.wait(WITHIN)
+        assert lease.lost is error
+
+
 def test_who_does_not_get_it_keeps_nothing_up(loop: LoopThread) -> None:
     service = Service(loop)
     service.refusal = RefusedError(RefusalCode.LEASED, "bob holds the lease")
@@ -134,14 +150,15 @@ def test_who_cannot_wait_for_the_standstill_gives_it_back(loop: LoopThread) -> N
     assert [service.next()[0] for _ in range(2)] == [Command.ACQUIRE, Command.RELEASE]
 
 
-def test_a_lease_outlasts_a_gateway_that_is_restarted_within_its_time_out() -> None:
+@pytest.mark.parametrize("error", PASSING)
+def test_a_lease_outlasts_a_gateway_that_is_busy_or_restarted_within_its_time_out(error: TrirailError) -> None:
     """The loop still holds the lease: one of the four renewals within a time-out is enough."""
     asked: list[Command] = []
 
     async def command(name: Command, _content: bytes) -> CommandReply:
         asked.append(name)
         if len(asked) == 3:
-            raise ServiceError("no robot 'demo' answers")
+            raise error
         return CommandReply(name, Mode.HOLDING, 0)
 
     async def hold() -> None:

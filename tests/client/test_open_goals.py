@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 from trirail.client.goal import AsyncGoalHandle, OpenGoals, Result
+from trirail.errors import ServiceError, WaitTimeoutError
 from trirail.wire.marks import Switch
 from trirail.wire.messages import GoalReply
 
@@ -36,26 +39,56 @@ def test_a_used_id_that_is_refused_leaves_the_first_handle() -> None:
     assert repr(first) == "<AsyncGoalHandle g1 done>"
 
 
-@given(st.lists(st.tuples(st.sampled_from(["open", "accept", "refuse", "end"]), st.integers(0, 7)), max_size=40))
+def ended(goal: AsyncGoalHandle) -> bool:
+    """Whether a wait for the goal returns at once, or raises an error."""
+    return goal._ended.is_set()
+
+
+def test_a_wait_for_a_goal_of_an_earlier_run_is_over() -> None:
+    async def wait() -> None:
+        goals: OpenGoals = OpenGoals()
+        goals.accept(goal := goals.open(handle("g1")), structs.replace(reply("g1"), run="r1"))
+        goals.lose_others("r1")
+        with pytest.raises(WaitTimeoutError):
+            await goal.wait(0.0)
+        goals.lose_others("r2")
+        with pytest.raises(ServiceError, match="started again: the end of goal g1 is unknown"):
+            await goal.wait()
+
+    asyncio.run(wait())
+
+
+STEPS = ["open", "accept", "refuse", "end", "restart"]
+
+
+@given(st.lists(st.tuples(st.sampled_from(STEPS), st.integers(0, 7)), max_size=40))
 def test_every_handle_of_an_accepted_call_ends(steps: list[tuple[str, int]]) -> None:
-    """Calls of several threads with few ids, answered in any order; the end of a goal may come before its answer."""
+    """Calls of several threads with few ids, answered in any order; the end of a goal may come before its answer.
+
+    A service that starts again does not report the ends of earlier goals.
+    """
     goals: OpenGoals = OpenGoals()
     under_way: list[AsyncGoalHandle] = []
     accepted: list[AsyncGoalHandle] = []
+    run = 0
     for step, number in steps:
         if step == "open":
             under_way.append(goals.open(handle(IDS[number % 2])))
         elif step == "end":
             goals.end(Result(IDS[number % 2], "done", ""))
+        elif step == "restart":
+            run += 1
+            goals.lose_others(f"r{run}")
+            assert all(ended(each) for each in accepted)
         elif under_way:
             call = under_way.pop(number % len(under_way))
             if step == "accept":
-                goals.accept(call, reply(call.id))
+                goals.accept(call, structs.replace(reply(call.id), run=f"r{run}"))
                 accepted.append(call)
             else:
                 goals.refuse(call.id)
     for each, goal_id in itertools.product(accepted, IDS):
-        if each.result is None and each.id == goal_id:
+        if not ended(each) and each.id == goal_id:
             goals.end(Result(goal_id, "done", ""))
             assert each.result is not None
     for call in under_way:

@@ -20,7 +20,7 @@ from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
 from trirail.processes.incoming import GOAL_PATIENCE, GOALS_OF_ONE, Incoming
 from trirail.processes.replies import REFUSALS_PER_SECOND
-from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER
+from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER, REPLY_TIMEOUT_S
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.event_codes import EventCode
@@ -45,7 +45,7 @@ from trirail.wire.packets import (
 from trirail.wire.records import DTYPE
 from trirail.wire.sizes import MAX_PART
 from trirail.wire.state import Info
-from trirail.wire.vocabulary import AcquireLease, Command, Mode, Role
+from trirail.wire.vocabulary import AcquireLease, Command, Mode, Role, Stop
 from trirail_drivers.interface import MissingProtection
 
 
@@ -295,6 +295,57 @@ def test_commands_of_one_are_bounded_and_leave_the_others_theirs(rig: Rig) -> No
     rig.command("resume", user="ann")
     users = [request.user for request in rig.commands()]
     assert users == ["eve"] * MAX_COMMANDS_OF_USER + ["ann"]
+
+
+def test_commands_of_others_do_not_end_a_lease(rig: Rig) -> None:
+    for number in range(9 * MAX_COMMANDS_OF_USER):
+        rig.command("resume", user=f"eve{number % 9}")
+    before = len(rig.commands())
+    for _ in range(2):  # the second waits for the answer to the first, as every command
+        rig.command("acquire", b'{"id": "l", "timeout": 0.5}')
+    assert [request.name for request in rig.commands()[before:]] == ["acquire"]
+    rig.hear(CommandDone(rig.commands()[-1].ticket, Command.ACQUIRE, "holding", 1))
+    rig.command("acquire", b'{"id": "l", "timeout": 0.5}')
+    assert [request.name for request in rig.commands()[before:]] == ["acquire"] * 2
+
+
+@pytest.mark.parametrize("kind", ["pose", "velocity", "track"])
+def test_a_goal_that_is_answered_too_late_does_not_begin(rig: Rig, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """Its sender has been told that it is not carried out. A jog or track ends by its own time-out."""
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    content = json.dumps({"kind": kind, "x": 0, "y": 0, "phi": 0, "id": "g"}).encode()
+    rig.gateway._handle(came("goal", "trirail/demo/goal/ann", content))
+    rig.gateway._requests.expire()
+    assert rig.commands() == []
+    now += REPLY_TIMEOUT_S + 0.1
+    rig.gateway._requests.expire()
+    assert [(stop.user, stop.name, stop.content) for stop in rig.commands()] == (
+        [("ann", Command.STOP, Stop("g"))] if kind == "pose" else []
+    )
+    rig.gateway._requests.expire()
+    assert len(rig.commands()) == (kind == "pose")
+
+
+def test_enabling_may_take_as_long_as_is_configured(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    for name in ("enable", "reset"):
+        rig.command(name)
+    now += REPLY_TIMEOUT_S + 0.9 * CONFIG.watchdogs.enable_timeout
+    rig.gateway._requests.expire()
+    assert list(rig.gateway._requests._commands) == [1]
+    now += 0.2 * CONFIG.watchdogs.enable_timeout
+    rig.gateway._requests.expire()
+    assert not rig.gateway._requests._commands
+
+
+def test_a_goal_is_accepted_with_the_run_that_reports_its_end(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    replies: list[object] = []
+    monkeypatch.setattr(rig.gateway._requests, "answer", lambda _, reply: replies.append(reply))
+    rig.gateway._run = "r1"
+    rig.hear(Accepted(1, GoalReply("g", 1.0)))
+    assert replies == [GoalReply("g", 1.0, run="r1")]
 
 
 def test_what_is_refused_of_one_who_floods_leaves_room_to_tell_of_the_others(rig: Rig) -> None:

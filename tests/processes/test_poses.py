@@ -385,6 +385,7 @@ def test_a_gateway_that_is_started_again_goes_on_without_what_cannot_be_read_and
     kept = [path for path in folder.iterdir() if path.name.startswith("poses.json.broken")]
     assert sorted(path.read_bytes() for path in kept) == sorted(contents)
     later.teach("pick")
+    assert later.poses.warnings() == (), "the file has every taught pose again"
     assert make(PARKED, again=True).known().keys() == {"park", "pick"}
 
 

@@ -12,6 +12,7 @@ from trirail.processes.memory_budget import Budget
 from trirail.processes.trajectory_parts import PARTS_WITHIN, TrajectoryParts
 from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 from trirail.wire.kinds.trajectory import TrajectoryPart, parts
+from trirail.wire.marks import Mark, StopAt
 from trirail.wire.packed_trajectory import PackedTrajectory, packed
 from trirail.wire.packets import GoalRequest, decode_request, message
 from trirail.wire.sizes import MAX_PART, MAX_POINTS
@@ -106,6 +107,8 @@ def test_a_part_that_does_not_go_with_the_others_is_refused_and_says_why() -> No
             "part 2 states a total of 4 parts, the other parts state 3",
         ),
         (msgspec.structs.replace(sent[1], stretch=not sent[1].stretch), "part 2 has other options"),
+        (msgspec.structs.replace(sent[1], stop_at=StopAt("probe")), "part 2 has other options"),
+        (msgspec.structs.replace(sent[1], marks=(Mark("pump", after_start=0.01),)), "part 2 has other options"),
     ):
         rig = Rig()
         rig.add(sent[0])

@@ -59,6 +59,8 @@ REPORT_WITHIN = 2.0
 """Time-out of the reply to an alignment report [s]."""
 HOME_WITHIN = 600.0
 """Time-out of homing [s]; it allows for three drives with the longest homing time-out."""
+ENABLE_WITHIN = 75.0
+"""Time-out of enabling [s]; it allows for the longest plausible `watchdogs.enable_timeout`, 60 s."""
 T = TypeVar("T")
 
 
@@ -81,6 +83,8 @@ class AsyncRobot:
         self._opened = AsyncExitStack()
         self._open: AsyncConnection | None = None
         self._goals = OpenGoals()
+        self._runs: set[str] = set()
+        """Runs of the service from which events have arrived."""
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
@@ -117,7 +121,7 @@ class AsyncRobot:
     async def _shared(self, connection: Connection) -> AsyncRobot:
         """Return a robot for the running event loop that shares the connection but registers its goals separately."""
         shared = copy.copy(self)
-        shared._opened, shared._goals = AsyncExitStack(), OpenGoals()
+        shared._opened, shared._goals, shared._runs = AsyncExitStack(), OpenGoals(), set()
         await shared._use(connection)
         return shared
 
@@ -580,7 +584,7 @@ class AsyncRobot:
         payload = content_message(name, content)
         if name in STOPS:
             return await self._connection.stop(self.user, name, payload, REPLY_WITHIN)
-        within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
+        within = {Command.HOME: HOME_WITHIN, Command.ENABLE: ENABLE_WITHIN}.get(Command(name), REPLY_WITHIN)
         return await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within)
 
     async def info(self) -> Info:
@@ -657,6 +661,9 @@ class AsyncRobot:
         return self._open
 
     def _on_event(self, event: Event) -> None:
+        if event.run and event.run not in self._runs:
+            self._runs.add(event.run)
+            self._goals.lose_others(event.run)
         self._goals.note_switches(event.marks)
         if (result := result_of(event)) is not None:
             self._goals.end(result)

@@ -22,6 +22,16 @@ T = TypeVar("T")
 Held = TypeVar("Held", bound=AsyncJog | AsyncLease | AsyncTrack)
 
 
+CANCELLED_WITHIN = 1.0
+"""Maximum time for which a cancelled call waits for the end of its coroutine [s]."""
+
+
+async def _wait_for_cancelled() -> None:
+    """Wait until all cancelled tasks of the running event loop have ended."""
+    if cancelled := [task for task in asyncio.all_tasks() if task.cancelling()]:
+        await asyncio.wait(cancelled)
+
+
 class LoopThread:
     """Separate thread with an event loop that runs coroutines for other threads."""
 
@@ -37,7 +47,8 @@ class LoopThread:
     def call(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine and return its result. An exception in the waiting thread, such as Ctrl-C, cancels it.
 
-        Raises ServiceError if the loop is closed before the coroutine ends.
+        A cancelled coroutine may still send a stop, so the call waits a short time for its end. Raises ServiceError if
+        the loop is closed before the coroutine ends.
         """
         future = self._submit(coroutine)
         try:
@@ -46,6 +57,8 @@ class LoopThread:
             raise ServiceError(CLOSED) from None
         except BaseException:
             future.cancel()
+            with contextlib.suppress(TrirailError, TimeoutError, CancelledError):
+                self._submit(_wait_for_cancelled()).result(CANCELLED_WITHIN)
             raise
 
     def start(self, coroutine: Coroutine[Any, Any, object]) -> Future[object]:

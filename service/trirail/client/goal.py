@@ -68,6 +68,8 @@ class AsyncGoalHandle:
         """Reply of the service that accepted the goal."""
         self._command = command
         self._result: Result | None = None
+        self._lost = ""
+        """Reason why the result will remain unknown."""
         self._ended = asyncio.Event()
 
     def __repr__(self) -> str:
@@ -103,21 +105,21 @@ class AsyncGoalHandle:
         """Wait until the goal ends; return its result. The `outcome` of the result is "done" if the goal succeeded.
 
         Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues. Raises ServiceError
-        if the client is closed before the goal ends.
+        if the client is closed before the goal ends, or if the service has started again, so that its end is unknown.
         """
         within = seconds(timeout)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within):
                 await self._ended.wait()
         if self._result is None and self._ended.is_set():
-            raise ServiceError(CLOSED)
+            raise ServiceError(self._lost)
         if self._result is None:
             raise WaitTimeoutError(f"goal {self.id} has not ended within {within:g} s")
         return self._result
 
-    def end(self, result: Result | None) -> None:
-        """Set the result, which is None if the client is closed before, and wake the tasks that wait for the goal."""
-        self._result = result
+    def end(self, result: Result | None, reason: str = CLOSED) -> None:
+        """Set the result, which is None if it remains unknown for a `reason`, and wake the tasks that wait for it."""
+        self._result, self._lost = result, reason
         self._ended.set()
 
 
@@ -168,6 +170,14 @@ class OpenGoals:
         """End the waits for all goals, because no further event arrives."""
         for handle in self._handles.values():
             handle.end(None)
+
+    def lose_others(self, run: str) -> None:
+        """End the waits for the goals that an earlier run of the service has accepted, given its present run."""
+        for goal_id in [name for name in self._accepted if self._handles[name].reply.run not in ("", run)]:
+            self._accepted.discard(goal_id)
+            self._switches.pop(goal_id, None)
+            handle = self._handles.pop(goal_id)
+            handle.end(None, f"the service has started again: the end of goal {goal_id} is unknown")
 
     def note_switches(self, switches: Iterable[Switch]) -> None:
         """Store output switches for the results of their goals; ignore switches of goals that are not registered.

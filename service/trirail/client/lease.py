@@ -11,12 +11,14 @@ from typing import Self
 import msgspec
 
 from trirail.client.outgoing import number, seconds
-from trirail.errors import ServiceError, TrirailError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 
 SIGNS = 4
 """Number of renewals per time-out; the lease continues if at least one of them arrives."""
+_PASSING = RefusalCode.BUSY, RefusalCode.TIMEOUT
+"""Refusals of a renewal that do not end the lease."""
 
 
 class AsyncLease:
@@ -78,6 +80,9 @@ class AsyncLease:
             except TimeoutError:
                 self.lost = ServiceError(f"the service has not renewed the lease within {self._sign.timeout:g} s")
             except TrirailError as error:
-                if not isinstance(error, ServiceError) or now() >= until:  # otherwise, the gateway may be restarting
+                passing = isinstance(error, ServiceError) or (
+                    isinstance(error, RefusedError) and error.code in _PASSING
+                )
+                if not passing or now() >= until:  # until then, the gateway may be busy, or restarting
                     self.lost = error
         self._over.set()

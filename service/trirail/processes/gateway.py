@@ -127,6 +127,7 @@ class Gateway:
         )
         self._heap = HeapTrim()
         self._ending = False
+        self._run = run
         self._publications = Publications(session, self._robot, run)
 
     def serve(self, ready: Callable[[], None]) -> None:
@@ -274,7 +275,9 @@ class Gateway:
                 self._handle_event(event)
             case Status() | Welcome():
                 self._states.update(answer)
-            case Accepted(ticket, reply) | Checked(ticket, reply):
+            case Accepted(ticket, reply):
+                self._requests.answer(ticket, msgspec.structs.replace(reply, run=self._run))
+            case Checked(ticket, reply):
                 self._requests.answer(ticket, reply)
             case CommandDone(ticket, name, mode, cycle):
                 self._commands.confirmed(ticket)

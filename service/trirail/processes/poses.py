@@ -221,6 +221,7 @@ class Poses:
                 self._taught[change.name] = pose
             else:
                 del self._taught[change.name]
+            self._lacking = ""  # the file now has every taught pose
             self._reply(change.incoming, self._named(change.name, pose))
             text = _words(change)
             self._announce(Notice("pose", "info", text.text, user=change.user, **text.fields))

@@ -82,7 +82,8 @@ class Requests:
         `urgent_section` returns a context. The loop handles packets sent within it in the cycle in which they arrive.
         """
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
-        self._home_within = REPLY_TIMEOUT_S + sum(homing)
+        self._takes = {Command.HOME: sum(homing), Command.ENABLE: config.watchdogs.enable_timeout}
+        """Longest time that a command may take, besides REPLY_TIMEOUT_S [s]."""
         self._takeover = config.control.takeover
         self._link = link
         self._urgent_section = urgent_section
@@ -91,10 +92,12 @@ class Requests:
         self._loop_death = loop_death
         self.backlog = Backlog()
         """Goals that have not been sent to the loop yet."""
-        self._goals: dict[int, str] = {}
-        """User of each goal in the loop, by ticket."""
+        self._goals: dict[int, GoalRequest] = {}
+        """Goals in the loop, by ticket."""
         self._commands: dict[int, str] = {}
         """User of each command and check in the loop, by ticket."""
+        self._acquires: dict[int, str] = {}
+        """User of each request for the lease in the loop, by ticket."""
         self._pending: dict[int, _PendingRequest] = {}
         self._tickets = time.monotonic_ns()
 
@@ -117,7 +120,7 @@ class Requests:
 
     def send_goals(self) -> None:
         """Send goals to the loop, up to the limits per user and in total."""
-        of = Counter(self._goals.values())
+        of = Counter(goal.user for goal in self._goals.values())
         for user in self.backlog.users:
             if len(self._goals) >= MAX_GOALS:
                 return
@@ -126,7 +129,7 @@ class Requests:
                 if not self._link.send(message(request)):
                     return
                 self.backlog.drop_first(user)
-                self._goals[request.ticket] = user
+                self._goals[request.ticket] = request
                 self._loop_death.follow(request)
                 self._pending[request.ticket] = _PendingRequest(incoming, time.monotonic() + REPLY_TIMEOUT_S)
 
@@ -145,14 +148,17 @@ class Requests:
         Raises RefusedError if too many commands are in progress, or if the command takes over the lease and the role of
         the user does not allow that.
         """
-        if not name.stops:
+        renews = name is Command.ACQUIRE and user not in self._acquires.values()
+        if not (name.stops or renews):  # other commands must not end a lease
             self._check_command_count(user)
         if isinstance(content, AcquireLease) and content.force:
             self._guard.check(user, self._takeover, "taking over the lease")
         self._tickets += 1
         request = CommandRequest(self._tickets, user, name, content)
         with self._urgent_section() if name.stops else nullcontext():
-            self._send(incoming, request, self._home_within if name is Command.HOME else REPLY_TIMEOUT_S)
+            self._send(incoming, request, REPLY_TIMEOUT_S + self._takes.get(name, 0.0))
+        if name is Command.ACQUIRE:
+            self._acquires[request.ticket] = user
         return request.ticket
 
     def check(self, incoming: Incoming, user: str, goal: LoopGoal) -> None:
@@ -186,15 +192,24 @@ class Requests:
         """Answer the request with this ticket. If the request was a goal, send the next goals to the loop."""
         waiting = self._pending.pop(ticket, None)
         self._commands.pop(ticket, None)
+        self._acquires.pop(ticket, None)
         if waiting is not None:
             self._replies.answer(waiting.incoming, content)
         if self._goals.pop(ticket, None) is not None:
             self.send_goals()
 
     def expire(self) -> None:
-        """Answer requests that the loop has not answered in time with a time-out error."""
+        """Answer requests that the loop has not answered in time with a time-out error.
+
+        A goal that has such an answer must not begin later, so the loop is told to stop it.
+        """
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._pending.items() if waiting.deadline < now]:
+            goal = self._goals.get(ticket)
+            if goal is not None and not goal.goal.renewed:
+                self._tickets += 1
+                with self._urgent_section():
+                    self._link.send(message(CommandRequest(self._tickets, goal.user, Command.STOP, Stop(goal.id))))
             self.answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "the request was not carried out in time"))
 
 

@@ -120,7 +120,8 @@ def _check(incomplete: _Incomplete, goal: TrajectoryGoal, number: int, of: int) 
     elif number in incomplete.received:
         problem = "has already been received"
     elif first is not None and _options(first.goal) != _options(goal):
-        problem = "has other options than the earlier parts: give all parts the same stretch, settle and valid_for"
+        options = "stretch, settle, valid_for, marks and stop_at"
+        problem = f"has other options than the earlier parts: give all parts the same {options}"
     elif points > MAX_POINTS:
         problem = (
             f"makes {points} points in total, the maximum is {MAX_POINTS}: send fewer, since paths between points are "
@@ -131,5 +132,5 @@ def _check(incomplete: _Incomplete, goal: TrajectoryGoal, number: int, of: int) 
         raise RefusedError(RefusalCode.MALFORMED, text)
 
 
-def _options(goal: PackedTrajectory | TrajectoryGoal) -> tuple[bool, bool, float | None]:
-    return goal.stretch, goal.settle, goal.valid_for
+def _options(goal: PackedTrajectory | TrajectoryGoal) -> tuple[object, ...]:
+    return goal.stretch, goal.settle, goal.valid_for, goal.marks, goal.stop_at

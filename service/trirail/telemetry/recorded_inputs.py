@@ -50,7 +50,9 @@ _PLANS = {
 }
 """Recorded fields of each kind of planner's answer, including the fields of the reply to the goal."""
 _OLDEST = ("id", "duration", "slowed", "stops_first", "queued", "lag", "accepted")
-_LATER = tuple(name for name in GoalReply.__struct_fields__ if name not in _OLDEST)
+_REPLY = tuple(name for name in GoalReply.__struct_fields__ if name != "run")
+"""Recorded fields of a reply to a goal. The gateway adds `run`, which the loop does not know."""
+_LATER = tuple(name for name in _REPLY if name not in _OLDEST)
 """Fields that were added to the reply later. A field is recorded only if its value differs from _PLAIN_REPLY."""
 _PLAIN_REPLY = GoalReply("", None)
 _Line = dict[str, Any]
@@ -93,7 +95,8 @@ def _recorded_notice(notice: Notice) -> _Line:
 def _recorded_plan(plan: PreemptingMotion | PathExtension) -> _Line:
     """Return the fields with which an answer from the planner is recorded."""
     fields = msgspec.to_builtins(plan)
-    fields |= fields.pop("reply")
+    reply = fields.pop("reply")
+    fields |= {name: reply[name] for name in _REPLY}
     later = [name for name in _LATER if getattr(plan.reply, name) != getattr(_PLAIN_REPLY, name)]
     if plan.switches:
         later.append("switches")
@@ -113,6 +116,6 @@ def _announcement(entry: _Line) -> _Line:
 
 def _plan(entry: _Line) -> _Line:
     """Return the fields of an answer from the planner, given its recorded fields."""
-    reply = {name: entry.pop(name) for name in GoalReply.__struct_fields__ if name in entry}
+    reply = {name: entry.pop(name) for name in _REPLY if name in entry}
     unrecorded = {"id": "", "duration": None, "queued": entry["type"] == "Extended"}
     return entry | {"reply": unrecorded | reply}

@@ -48,6 +48,9 @@ class GoalReply(Struct, frozen=True):
     of a track [m]. None for other goals."""
     marks: tuple[PlacedMark, ...] = ()
     """Places at which the marks of the goal will first switch their outputs."""
+    run: str = ""
+    """Identity of the run of the service that accepted the goal, as in Event: a service that has started again with
+    another `run` does not report the end of the goal."""
     accepted: Literal[True] = True
 
     def with_duration(self, duration: float) -> GoalReply:
