@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from control.test_control import PERIOD, ROBOT, assert_within_limits
 from control_rig import CONFIG, ControlRig, expected_duration
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from refusals import refusal
 from trirail.motion.feasibility import Checker
@@ -100,6 +100,34 @@ def test_whatever_its_ends_the_setpoints_stay_within_the_limits(
     rig.until(rig.holds, 20_000)
     rig.send("back", PoseGoal(0.0, 0.0, 0.0))
     rig.until(rig.holds)
+    assert rig.control.fault is None
+    assert_within_limits(rig)
+
+
+SHARE = st.floats(-1.2, 1.2)
+"""Acceleration at an end, as a share of that which the jerk limit allows in one cycle."""
+
+
+@settings(max_examples=60)
+@example(first=(0.0224 / 0.04, 0.0, 0.0), last=(0.0, 0.0, 0.0), seconds=0.18, way=0.0029)
+@example(first=(0.0, 0.0, 0.0), last=(-0.0355 / 0.04, 0.0, 0.0), seconds=0.169, way=0.0025)
+@given(st.tuples(SHARE, SHARE, SHARE), st.tuples(SHARE, SHARE, SHARE), st.floats(0.05, 0.6), st.floats(-0.01, 0.01))
+def test_whatever_its_accelerations_at_rest_the_setpoints_stay_within_the_limits(
+    first: tuple[float, float, float], last: tuple[float, float, float], seconds: float, way: float
+) -> None:
+    rig = ControlRig()
+    rig.enable()
+    jerk = CONFIG.limits.platform.jerk
+    begin, end = (
+        tuple(share * limit * PERIOD for share, limit in zip(each, jerk, strict=True)) for each in (first, last)
+    )
+    still = {"velocity": (0.0, 0.0, 0.0)}
+    points = (
+        TrajectoryPoint(0.0, 0.0, 0.0, 0.0, acceleration=begin, **still),  # type: ignore[arg-type]
+        TrajectoryPoint(seconds, way, 0.0, 0.0, acceleration=end, **still),  # type: ignore[arg-type]
+    )
+    rig.send("g", TrajectoryGoal(points))
+    rig.until(rig.holds, 20_000)
     assert rig.control.fault is None
     assert_within_limits(rig)
 

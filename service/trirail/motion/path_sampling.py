@@ -19,6 +19,8 @@ __all__ = ["survey"]
 TURN_CLEARANCE = 1e-3
 """Distance from a limit within which the turning point of a position is computed exactly [m, rad]."""
 UNIT_WEIGHTS = (1.0, 1.0, 1.0)
+MIN_END_ACCELERATION = 1e-9
+"""Acceleration of the sliders at an end of a path below which the path counts as ending without acceleration [m/s²]."""
 RETURN_SLOWDOWN = 10.0
 """Factor by which velocities are reduced while the robot returns from outside its limits."""
 MIN_PEAK = 1.0 + 1e-4
@@ -297,6 +299,26 @@ def _sample_path(
     return last, math.nan
 
 
+@compiled()
+def _measure_jump(problem: PathProblem, edge: float, time: float, step: float, near: Array, worst: Array) -> None:
+    """Update the jerk in `worst` at an end of the path, `edge`, at which the acceleration is not 0.
+
+    The setpoint next to the standstill may lie anywhere within the first or last step of the path, which ends or begins
+    at `time`. The jerk of that step is therefore added to the jump of the acceleration.
+    """
+    motion, sliders, arms = np.empty((3, 3, 3)), np.empty((3, 6, 3)), np.empty((2, 3, 3))
+    if not _solve_at(problem, edge, near, motion[0], sliders[0]) or np.abs(sliders[0, 2]).max() <= MIN_END_ACCELERATION:
+        return
+    if not _solve_at(problem, time, near, motion[0], sliders[0]):
+        return
+    motion[1], sliders[1] = motion[0], sliders[0]
+    motion[1, 1:], sliders[1, 1:3] = 0.0, 0.0
+    for i in range(3):
+        weights = problem.shares[0, i], problem.shares[1, i], problem.shares[2, i]
+        _measure_rates(sliders[1], sliders[0], i, step, False, worst[0], weights)
+    _measure_tool(problem, time, motion, arms, step, False, worst)
+
+
 @compiled(
     f"f8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[:, ::1], f8[::1], f8[:, :, ::1], "
     "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])"
@@ -359,7 +381,13 @@ def survey(
         return first
     near[:] = start
     inside, leaves_at = _sample_path(problem, times, until, step, near, worst)
-    if not math.isnan(leaves_at):
+    if math.isnan(leaves_at):
+        if law_at(law_knots, law_pieces, until)[0] >= knots[-1] - ROUNDING:
+            _measure_jump(problem, until, max(until - step, first, 0.0), step, near, worst)
+        if first < 0.0:
+            near[:] = start
+            _measure_jump(problem, 0.0, min(step, until), step, near, worst)
+    else:
         motion, sliders = np.empty((3, 3)), np.empty((6, 3))
         inside = max(inside, first)
         for _ in range(BISECTIONS // 3):
