@@ -15,6 +15,7 @@ from trirail.config import SIM, Config, Input, Output, load
 from trirail.control.outputs import LOG_LENGTH, SWITCHED
 from trirail.errors import RefusalCode
 from trirail.wire.event_codes import EventCode
+from trirail.wire.goal_kind import OwnLimits
 from trirail.wire.goals import MoveGoal, PoseGoal
 from trirail.wire.marks import Mark, StopAt, Switch
 from trirail.wire.messages import GoalReply
@@ -309,6 +310,32 @@ def test_pulses_last_their_width_and_are_closed_by_a_stop(rig: Rig) -> None:
     assert np.all(widths == round(0.01 / rig.config.period))
 
 
+@pytest.mark.parametrize("rate", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("queued", [False, True])
+def test_pulses_keep_their_number_and_width_at_every_override(rig: Rig, rate: float, queued: bool) -> None:
+    """At a rate above 1, pulses that are close at full speed would merge."""
+    rig.command("override", rate)
+    if queued:
+        rig.send("first", PoseGoal(0.01, 0.0, 0.0, blend=0.0, speed=0.4))
+    mark = Mark("valve", start=0.02, end=0.06, increment=0.002, pulse_width=0.016)
+    assert isinstance(rig.send("g", PoseGoal(0.08, 0.0, 0.0, speed=0.4, marks=(mark,))), Accepted)
+    rig.until(rig.holds, 20_000)
+    rig.cycles(100)
+    changes = rig.changes("valve")
+    assert [value for _, value in changes] == [True, False] * 21
+    assert np.all(np.diff([cycle for cycle, _ in changes])[::2] == 16)
+
+
+def test_a_goals_own_limits_apply_at_every_override(rig: Rig) -> None:
+    rig.command("override", 2.0)
+    own = OwnLimits(velocity=(0.05, 0.05, 0.5), acceleration=(0.2, 0.2, 1.0), jerk=(2.0, 2.0, 10.0))
+    assert isinstance(rig.send("g", PoseGoal(0.05, 0.0, 0.0, limits=own)), Accepted)
+    begun = len(rig.poses)
+    rig.until(rig.holds, 20_000)
+    speeds = np.diff(np.array(rig.poses[begun:])[:, 0]) / rig.config.period
+    assert speeds.max() == pytest.approx(0.05, rel=1e-3)
+
+
 @pytest.mark.parametrize("blend", [None, 0.01])
 def test_a_pulse_may_end_long_after_its_goal_is_done(rig: Rig, blend: float | None) -> None:
     rig.send("g1", PoseGoal(0.02, 0.0, 0.0, blend=blend, marks=(Mark("valve", after_start=0.005, pulse_width=2.0),)))
@@ -408,6 +435,26 @@ def test_a_goal_ends_at_an_edge(rig: Rig) -> None:
     assert end.params["x"] == pytest.approx(edge[0].params["x"])
     assert rig.poses[-1][0] < 0.045
     assert not rig.switches
+
+
+@pytest.mark.generated(*range(8))
+def test_a_section_ends_at_its_end_or_at_the_edge_that_ends_its_goal(rig: Rig, seed: int) -> None:
+    """Not where the robot comes to rest, far beyond both."""
+    rng = np.random.default_rng(seed)
+    pulses: dict[str, Any] = {"increment": 0.002, "pulse_width": 0.002} if seed % 2 else {}
+    mark = Mark("valve", start=0.005, end=0.02, **pulses)
+    rig.send("g", PoseGoal(0.08, 0.0, 0.0, speed=0.5, stop_at=StopAt("part"), marks=(mark,)))
+    place = rng.uniform(0.006, 0.03)
+    rig.until(lambda: rig.poses[-1][0] >= place)
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.cycle()
+    assert not rig.value("valve")
+    cycle = len(rig.words)
+    rig.until(rig.holds, 5000)
+    rig.cycles(100)
+    assert not [change for change in rig.changes("valve") if change[0] > cycle]
+    assert rig.outcomes() == [("g", "done")]
+    assert len(rig.switches) == len(rig.changes("valve"))
 
 
 def test_goals_behind_one_that_ends_at_an_edge_do_not_run(rig: Rig) -> None:

@@ -43,7 +43,7 @@ def test_every_kind_can_be_named_and_can_expire_and_what_is_renewed_has_a_time_o
     assert kind.timed == ("time" in given(kind))
     assert kind.renewed >= kind.frequent
     assert kind.renewed >= kind.waits_at_end
-    assert 0.0 < kind.greatest_rate <= math.inf
+    assert all(0.0 < example.greatest_rate <= math.inf for example in MOTIONS[kind].examples)
 
 
 @every_kind

@@ -11,7 +11,7 @@ from trirail.config import SIM, corrected_geometry, load
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.robot import inverse
 from trirail.motion.goal_planner import GoalPlanner
-from trirail.motion.marks import MAX_SWITCHES, GoalMarks, Placed, place_marks
+from trirail.motion.marks import BISECTIONS, MAX_SWITCHES, GoalMarks, Placed, place_marks
 from trirail.motion.runs import ZERO_RATES, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
@@ -91,6 +91,17 @@ def test_marks_lie_where_an_independent_integration_has_them(kind: str, seed: in
         assert mark.pose == pytest.approx([np.interp(mark.time, s, poses[:, i]) for i in range(3)], abs=1e-6)
     times = found.switches["s"]
     assert np.all(np.diff(times) >= 0.0)
+
+
+def test_the_planner_shows_that_it_lives_while_it_places_marks_on_a_path_of_the_sliders() -> None:
+    """Thousands of them take seconds, and a planner that seems to hang is killed."""
+    config, beats = ROBOTS["3-PRP"], []
+    legs = corrected_geometry(config).packed()
+    run = planned("3-PRP", SlidersGoal((0.08, -0.02, 0.03), speed=0.05))
+    mark = Mark("valve", start=0.0, increment=1e-4, pulse_width=0.001)
+    found = place_marks((mark,), run.path, legs, ZERO_RATES, config.period, lambda: beats.append(1))
+    assert len(found.switches) > 300
+    assert len(beats) > BISECTIONS
 
 
 @pytest.mark.parametrize("kind", ROBOTS)

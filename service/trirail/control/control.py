@@ -382,8 +382,11 @@ class Control:
 
     def _goal_ended(self, goal: str, outcome: Outcome) -> None:
         """Switch back the outputs that an ended goal has left switched, and report its switches before its end."""
-        self.outputs.close(goal, outcome, self.modes.cycle + self._concluding, self.measured.record)
+        self._close_outputs(goal, outcome)
         self._report_switches(all_=True)
+
+    def _close_outputs(self, goal: str, outcome: Outcome) -> None:
+        self.outputs.close(goal, outcome, self.modes.cycle + self._concluding, self.measured.record)
 
     def _report_switches(self, *, all_: bool = False) -> None:
         for switches in self.outputs.pop_switches(self.modes.cycle, all_=all_):
@@ -409,6 +412,7 @@ class Control:
                 self.ledger.end("stopped", reached, but=1)
                 self.modes.withdraw(ModeEvent.INPUT_EDGE, reached)
                 self.modes.apply_event(ModeEvent.INPUT_EDGE, reached)
+                self._close_outputs(goal.id, "stopped")  # at the edge, which is long before the rest
 
     def write(self) -> None:
         """Send the setpoints to the drives."""

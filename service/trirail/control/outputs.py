@@ -307,17 +307,25 @@ class Outputs:
         ends = [seam.s for seam in run.seams] if run is not None else []
         self._table = [goal for goal in goals if goal.has_switches]
         limits = dict(zip(map(id, goals), [*ends, math.inf], strict=False))
-        rows: list[tuple[float, int, int, bool, int, int]] = []
+        tables = [np.zeros(0, PLANNED)]
         for number, name in enumerate(self._names):
             row = self.state[number]
-            row["next"] = len(rows)
+            row["next"] = row["end"] = self.state[number - 1]["end"] if number else 0
             for goal in self._table:
-                for s, on, width, opens, mark in goal.pending(name, limits[id(goal)]):
-                    cycles = 0 if math.isnan(width) else max(1, round(width / self._period))
-                    rows.append((s, on, cycles, opens, self._number_of(goal.goal), mark))
-            row["end"] = len(rows)
+                tables.append(self._planned_switches(goal, name, limits[id(goal)]))
+                row["end"] += len(tables[-1])
         self._first = self.state["next"].tolist()
-        self.planned = np.array(rows, PLANNED)
+        self.planned = np.concatenate(tables)
+
+    def _planned_switches(self, goal: GoalMarks, output: str, end: float) -> NDArray[np.void]:
+        """Return the rows of the table for the switches of an output that a goal has left, up to a time of the path."""
+        switches, opens = goal.pending(output, end)
+        rows = np.zeros(len(switches), PLANNED)
+        if len(rows):
+            cycles = np.maximum(np.rint(switches["width"] / self._period), 1.0)
+            rows["s"], rows["on"], rows["mark"], rows["opens"] = switches["s"], switches["on"], switches["mark"], opens
+            rows["cycles"], rows["goal"] = np.where(np.isnan(cycles), 0.0, cycles), self._number_of(goal.goal)
+        return rows
 
     def _number_of(self, goal: str) -> int:
         if goal not in self._goals:

@@ -366,6 +366,9 @@ class PlanRequests:
             self._request = None
             return None
         schedule.append(extended.s, path, self._marks(extended.switches))
+        if self._goal is not None and self._goal.greatest_rate < self._greatest_rate:
+            self._greatest_rate = self._goal.greatest_rate
+            self.update_rate()
         return AcceptedPlan(extended.reply.with_duration(schedule.remaining if run.target else math.inf))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
-from trirail.motion.paths import ROUNDING, Path, constant_law, path_motion, platform_at_law_time
+from trirail.motion.paths import ROUNDING, Path, path_motion, platform_at_each
 from trirail.wire.marks import Mark, PlacedMark
 
 SWITCH: Final = np.dtype([("s", "<f8"), ("width", "<f8"), ("mark", "<i4"), ("on", "<i4")], align=True)
 """Layout of a switch: time along the path [s], duration of the pulse [s] (NaN if the switch is not a pulse), index of
 the mark in the goal, and new value of the output."""
+HIGHEST_RATE: Final = 2.0
+"""Rate of the time along the path at the highest override."""
 MAX_SWITCHES = 10_000
 """Greatest number of switches of one goal."""
 SAMPLES = 24
@@ -36,7 +38,14 @@ class Placed(NamedTuple):
     marks: tuple[PlacedMark, ...]
 
 
-def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[float], period: float) -> Placed:
+def place_marks(
+    marks: Sequence[Mark],
+    path: Path,
+    legs: Array,
+    start: Sequence[float],
+    period: float,
+    beat: Callable[[], None] = lambda: None,
+) -> Placed:
     """Locate the marks of a goal on its path.
 
     Parameters
@@ -51,6 +60,8 @@ def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[
         Pose of the platform's centre at the start of the path: x, y [m], phi [rad].
     period
         Period of the cycle [s].
+    beat
+        Function that is called repeatedly, since a path in slider space takes long if it has many marks.
 
     Raises
     ------
@@ -60,7 +71,7 @@ def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[
     """
     if not marks:
         return Placed(_NO_SWITCHES, ())
-    trace = _Trace(path, legs, start)
+    trace = _Trace(path, legs, start, beat)
     rows: list[tuple[float, float, int, int]] = []
     placed = []
     for number, mark in enumerate(marks):
@@ -100,17 +111,24 @@ class GoalMarks:
         """Whether the goal switches outputs."""
         return len(self._rows) > 0
 
-    def pending(self, output: str, end: float) -> Iterator[tuple[float, int, float, bool, int]]:
-        """Yield the remaining switches of an output, up to the time `end` along the path of the run.
+    def pending(self, output: str, end: float) -> tuple[NDArray[np.void], NDArray[np.bool]]:
+        """Return the remaining switches of an output, up to the time `end` along the path of the run.
 
-        Each tuple holds the time along the path of the run [s], the new value, the duration of the pulse [s] (NaN if
-        the switch is not a pulse), True if the goal later switches the output back, and the index of the mark.
+        Returns
+        -------
+        switches : (n,) of dtype SWITCH
+            Switches, with the time along the path of the run.
+        opens : (n,)
+            Whether the goal later switches the output back.
+
         """
-        for k in self._pending_rows(output):
-            s, width, mark, on = self._rows[k].tolist()
-            if self.begin + s <= end:
-                opens = self._marks[mark].closes and bool(on) == self._marks[mark].value
-                yield self.begin + s, on, width, opens, mark
+        rows = self._rows[self._pending_rows(output)]
+        rows["s"] += self.begin
+        rows = rows[rows["s"] <= end]
+        closes = np.array([mark.closes for mark in self._marks], np.bool)
+        values = np.array([mark.value for mark in self._marks], np.bool)
+        marks = rows["mark"]
+        return rows, closes[marks] & (values[marks] == rows["on"].astype(np.bool))
 
     def note_passed(self, output: str, number: int) -> None:
         """Record that the next `number` switches of an output have taken place."""
@@ -124,8 +142,8 @@ class GoalMarks:
 class _Trace:
     """Arc length and coordinates of a tool as functions of the time along its path."""
 
-    def __init__(self, path: Path, legs: Array, start: Sequence[float]) -> None:
-        self._path, self._legs = path, legs
+    def __init__(self, path: Path, legs: Array, start: Sequence[float], beat: Callable[[], None]) -> None:
+        self._path, self._legs, self._beat = path, legs, beat
         self._near = np.array(start, dtype=np.float64)
         shares = np.linspace(0.0, 1.0, SAMPLES, endpoint=False)
         spans = np.diff(path.knots)
@@ -154,15 +172,14 @@ class _Trace:
         return np.einsum("nij,nj->ni", p, powers), np.einsum("nij,nj->ni", p[:, :, 1:], slopes)
 
     def _platform_states(self, times: Array) -> tuple[Array, Array]:
-        law = constant_law(1.0)
-        out, near = np.zeros((3, 3)), self._near.copy()
-        states = np.zeros((2, len(times), 3))
-        for k in np.argsort(times, kind="stable"):  # each pose is on the branch of the previous pose
-            if platform_at_law_time(self._legs, *self._path, law.knots, law.pieces, times[k], near, out):
-                raise RefusedError(RefusalCode.BAD_MARK, "marks cannot be placed on a path through a singular pose")
-            near[:] = out[0]
-            states[:, k] = out[:2]
-        return states[0], states[1]
+        self._beat()
+        order = np.argsort(times, kind="stable")
+        motion = np.zeros((len(times), 3, 3))
+        if platform_at_each(self._legs, *self._path, times[order], self._near.copy(), motion):
+            raise RefusedError(RefusalCode.BAD_MARK, "marks cannot be placed on a path through a singular pose")
+        states = np.empty_like(motion)
+        states[order] = motion
+        return states[:, 0], states[:, 1]
 
     def pose_at(self, s: float) -> tuple[float, float, float]:
         """Return the pose of the platform's centre at a time along the path."""
@@ -276,14 +293,16 @@ def _check_length(number: int, mark: Mark, name: str, length: float, whole: floa
 def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: float) -> None:
     """Raise RefusedError if two switches of an output are too close to each other at full speed.
 
-    Two switches must not take place in the same cycle, and the next switch must wait until a pulse has ended.
+    Two switches must not take place in the same cycle at the highest override, and the next switch must wait until a
+    pulse has ended. Goals with pulses run at full speed at most.
     """
     for output in {mark.output for mark in marks}:
         own = switches[[marks[number].output == output for number in switches["mark"]]]
         if len(own) < 2:
             continue
         spacing = np.diff(own["s"])
-        needed = np.where(np.isnan(own["width"][:-1]), period, own["width"][:-1] + period)
+        apart = period if any(mark.pulse_width is not None for mark in marks) else period * HIGHEST_RATE
+        needed = np.where(np.isnan(own["width"][:-1]), apart, own["width"][:-1] + period)
         k = int(np.argmin(spacing - needed))
         if spacing[k] < needed[k]:
             number = int(own["mark"][k + 1])

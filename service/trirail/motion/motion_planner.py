@@ -37,7 +37,7 @@ class MotionPlanner:
     def __init__(self, config: Config, beat: Callable[[], None] = lambda: None) -> None:
         robot = corrected_geometry(config)
         self._legs = robot.packed()
-        self._period = config.period
+        self._period, self._beat = config.period, beat
         self._revision = revision(config)
         self._goals = GoalPlanner(robot, planned_limits(config.limits, config.correction.backlash), config.period, beat)
 
@@ -53,7 +53,7 @@ class MotionPlanner:
         number, version = request.number, request.version
         try:
             path = decided.path if isinstance(decided, Extension) else decided.run.path
-            placed = place_marks(request.goal.marks, path, self._legs, request.commanded[0], self._period)
+            placed = place_marks(request.goal.marks, path, self._legs, request.commanded[0], self._period, self._beat)
         except RefusedError as refusal:
             return _refusal(request, refusal)
         reply, switches = structs.replace(decided.reply, marks=placed.marks), placed.switches.tobytes()

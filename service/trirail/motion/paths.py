@@ -218,6 +218,29 @@ def platform_at_law_time(
     return platform_at(legs, knots, pieces, in_sliders, tools, law_at(law_knots, law_pieces, time), near, out)
 
 
+@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[:, ::1], f8[::1], f8[::1], f8[:, :, ::1])")
+def platform_at_each(
+    legs: Array,
+    knots: Array,
+    pieces: Array,
+    in_sliders: bool,
+    tools: Array,
+    times: Array,
+    near: Array,
+    out: Array,
+) -> int:
+    """Write the motion of the platform at ascending times along a path [s] into `out` (n, 3, 3); see platform_at.
+
+    Each pose is on the branch of the previous pose. Return 0, or the code of the first time that has no pose.
+    """
+    for k in range(len(times)):
+        code = platform_at(legs, knots, pieces, in_sliders, tools, (times[k], 1.0, 0.0), near, out[k])
+        if code != 0:
+            return code
+        near[:] = out[k, 0]
+    return 0
+
+
 @compiled("b1(f8[::1], f8[::1], f8[::1])")
 def is_valid_path(knots: Array, coefficients: Array, tools: Array) -> bool:
     """Return whether all numbers of a path are finite and no knot is less than the previous knot."""

@@ -201,7 +201,7 @@ class Requests:
     def expire(self) -> None:
         """Answer requests that the loop has not answered in time with a time-out error.
 
-        A goal that has such an answer must not begin later, so the loop is told to stop it.
+        A goal that has such an answer must not begin later, so it is stopped.
         """
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._pending.items() if waiting.deadline < now]:

@@ -112,8 +112,6 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     """Whether the goal stays active at the end of its path for as long as it is renewed."""
     timed: ClassVar[bool] = False
     """Whether the goal refers to a `time` [s]. The client gives wall-clock time; the planner receives loop time."""
-    greatest_rate: ClassVar[float] = math.inf
-    """Maximum rate of the motion at any override; 1 for goals with their own timing."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -142,6 +140,19 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     def stop_at(self) -> StopAt | None:
         """Edge of an input at which the goal ends; None if there is no such edge."""
         return None
+
+    @property
+    def limits(self) -> OwnLimits | None:
+        """Limits of this goal alone."""
+        return None
+
+    @property
+    def greatest_rate(self) -> float:
+        """Maximum rate of the motion at any override. It is 1 for goals with their own timing, limits or pulses: at a
+        higher rate, the goal would exceed its limits, and pulses would merge.
+        """
+        pulses = any(mark.pulse_width is not None for mark in self.marks)
+        return 1.0 if self.limits is not None or pulses else math.inf
 
     @property
     def settle(self) -> bool:

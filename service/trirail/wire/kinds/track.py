@@ -20,7 +20,6 @@ class TrackGoal(GoalKind, frozen=True, tag="track"):
     """
 
     renewed = frequent = waits_at_end = timed = True
-    greatest_rate = 1.0
 
     x: Coordinate
     """Target x of the platform's centre at `time`, in the base frame [m]."""
@@ -38,6 +37,11 @@ class TrackGoal(GoalKind, frozen=True, tag="track"):
     timeout: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.25
     """Time without a renewal after which the robot brakes [s]. It is real time, independent of the override."""
     valid_for: ValidFor = None
+
+    @property
+    def greatest_rate(self) -> float:
+        """Maximum rate of the motion, whose timing is that of the target."""
+        return 1.0
 
     @property
     def target(self) -> Triple:
