@@ -402,6 +402,62 @@ def test_the_sliders_never_go_faster_than_5_mm_a_second(tmp_path: Path, monkeypa
     assert 0.0049 < fastest[0] < 0.0051
 
 
+def move_alone(low: float, high: float, at: float) -> tuple[Judgement, list[float]]:
+    """Run the step `move` of slider A, at a position in limits [m]; return its judgement, and the positions on the way.
+
+    All lengths are in mm.
+    """
+    slider = ROBOT.limits.slider
+    ranges = ((low * 1e-3, high * 1e-3), (-0.1, 0.1), (-0.1, 0.1))
+    limits = msgspec.structs.replace(ROBOT.limits, slider=msgspec.structs.replace(slider, position=ranges))
+    start = msgspec.structs.replace(ROBOT.can.simulated, start=(at * 1e-3, 0.0, 0.0))
+    robot = msgspec.structs.replace(ROBOT, limits=limits, can=msgspec.structs.replace(ROBOT.can, simulated=start))
+    visited = []
+    with open_steps(robot, [], Beside(), lambda: False, sleep=lambda _: None) as steps:
+        steps.session.set_up()
+        rules = steps.session.environment.rules
+        assert rules is not None
+        bench, cycle = steps.session.bench(), benches.Bench.cycle
+
+        def watched(*rates: object) -> object:
+            visited.append(at + rules.read()[0] * 1e3)  # the rules read zero at the start
+            return cycle(bench, *rates)  # type: ignore[arg-type]
+
+        bench.cycle = watched  # type: ignore[method-assign, assignment]
+        judgement, _ = steps.move("A")
+    return judgement, [at, *visited]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "at", "to"),
+    [
+        (-20.0, 20.0, 0.0, 1.0),
+        (-20.0, 20.0, 18.5, 17.5),
+        (-1.0, 1.0, -0.5, 0.5),
+        (-1.0, 1.0, 0.5, -0.5),
+        (-1.0, 1.0, 0.0, 0.9),
+        (-0.5, 0.5, 0.0, 0.45),
+        (-0.5, 0.5, 0.2, -0.43),
+        (-20.0, 20.0, -22.0, -21.0),  # outside its limits: inwards
+        (-20.0, 20.0, 22.0, 21.0),
+    ],
+)
+def test_a_slider_moves_alone_within_its_limits(low: float, high: float, at: float, to: float) -> None:
+    judgement, visited = move_alone(low, high, at)
+    assert judgement.verdict == "ok", judgement
+    farthest = max(visited, key=lambda each: abs(each - at))
+    assert farthest == pytest.approx(to, abs=0.01)
+    assert min(low, at) - 0.001 <= min(visited) <= max(visited) <= max(high, at) + 0.001
+
+
+@pytest.mark.parametrize(("low", "high", "at"), [(-0.4, 0.4, 0.0), (-0.2, 0.2, 0.1)])
+def test_a_slider_without_room_for_a_test_does_not_move(low: float, high: float, at: float) -> None:
+    judgement, visited = move_alone(low, high, at)
+    assert judgement.verdict == "failed"
+    assert re.search(r"slider A: .* mm to the farther limit .* limits\.slider\.position\[0\]", judgement.words[0])
+    assert visited == pytest.approx([at] * len(visited), abs=1e-4)
+
+
 def test_a_drive_that_keeps_its_power_when_stopped_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[PowerState] = []
 

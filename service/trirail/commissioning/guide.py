@@ -117,7 +117,8 @@ def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
             "move",
             name,
             f"D{named(name)[1:]} moves 1 mm",
-            f"MOTION: drive {name} alone moves 1 mm and back, up to 5 mm/s. Keep both sides free; Ctrl-C stops.",
+            f"MOTION: drive {name} alone moves 1 mm, or less if its limits are near, and back, up to 5 mm/s. "
+            "Keep both sides free; Ctrl-C stops.",
             partial(steps.move, name),
             (("power", name),),
             (("push", name),),

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from ruckig import InputParameter, Ruckig, Trajectory
 
+from trirail.commissioning.coupling import MAX_BACKLASH_M
 from trirail.config import Config, SliderLimits, geometry
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.robot import forward, inverse
@@ -16,6 +17,10 @@ from trirail.quantities import beyond
 
 TEST_DISTANCE_M = 0.001
 """Travel of a single slider, and length of the sides of the platform's square [m]."""
+MIN_TEST_DISTANCE_M = MAX_BACKLASH_M
+"""Minimum travel of a single slider that can be judged [m]. Play can absorb a shorter one completely."""
+ROOM_SHARE = 0.9
+"""Fraction of the room up to a limit that a single slider uses. It overshoots, and a measured position has noise."""
 MAX_VELOCITY = 0.005
 """Velocity limit of all motions [m/s]."""
 MAX_ACCELERATION = 0.05
@@ -34,6 +39,35 @@ class SlowMove(NamedTuple):
     """Offsets from the start, (N, 3) [m]."""
     velocity: Array
     """Velocities, (N, 3) [m/s]."""
+
+
+def choose_distance(position: float | None, limits: tuple[float, float]) -> float:
+    """Return the signed test distance of a slider [m], with which it stays within its `limits` [m].
+
+    The slider moves in its positive direction unless the upper limit is near and the lower one is farther away. A
+    slider outside its limits moves inwards.
+
+    Parameters
+    ----------
+    position
+        Position of the slider [m]; None if it is unknown, which is assumed to be the middle of the travel.
+
+    Raises
+    ------
+    ValueError
+        If the slider has less room than `MIN_TEST_DISTANCE_M` in both directions.
+    """
+    low, high = limits
+    at = (low + high) / 2.0 if position is None else position
+    up, down = high - at, at - low
+    direction, available = (1.0, up) if up >= 2.0 * TEST_DISTANCE_M or up >= down else (-1.0, down)
+    distance = min(TEST_DISTANCE_M, ROOM_SHARE * available)
+    if distance < MIN_TEST_DISTANCE_M:
+        raise ValueError(
+            f"{available * 1e3:.2f} mm to the farther limit is too little for a test, which needs "
+            f"{MIN_TEST_DISTANCE_M / ROOM_SHARE * 1e3:.2f} mm"
+        )
+    return direction * distance
 
 
 def plan_profile(distance: float, limits: SliderLimits, period: float) -> tuple[Array, Array]:

@@ -144,7 +144,10 @@ class Steps:
         """Move a single enabled drive out and back. The person reports which slider moved, and how far."""
         index, drives = NAMES.index(name), self._config.drives
         resolution = self._observer.ask_rule_resolution()
-        commanded = self._choose_distance(index)
+        try:
+            commanded = self._choose_distance(index)
+        except ValueError as error:
+            return Judgement("failed", (str(error),), "move the slider towards the middle of its travel"), {}
         before = self._observer.ask_rule(index)
         before_all = self._observer.read_rules()
         out = self._move_slider(index, commanded)
@@ -263,15 +266,19 @@ class Steps:
         return _SliderMotion(bench.position[index] - before, bench.max_errors[index], stopped)
 
     def _choose_distance(self, index: int) -> float:
-        """Return the signed test distance of a slider [m].
-
-        The distance is negative if the slider is known to be near the upper end of its travel.
-        """
-        bench = self.session.bench()
-        is_near_end = (
-            bench.position[index] + 2.0 * moves.TEST_DISTANCE_M > self._config.limits.slider.positions[index][1]
-        )
-        return -moves.TEST_DISTANCE_M if is_near_end and bench.feedback.homed[index] else moves.TEST_DISTANCE_M
+        """Return the signed test distance of a slider [m]. Raises ValueError if its limits leave no room for a test."""
+        bench, slider = self.session.bench(), self._config.limits.slider
+        limits = slider.positions[index]
+        try:
+            distance = moves.choose_distance(bench.position[index] if bench.feedback.homed[index] else None, limits)
+        except ValueError as error:
+            raise ValueError(f"slider {self._labels[index]}: {error} in {slider.keys('position')[index]}") from error
+        if abs(distance) < moves.TEST_DISTANCE_M:
+            self._operator.show(
+                f"  It moves {abs(distance) * 1e3:.2f} mm only, because {slider.keys('position')[index]} = "
+                f"[{limits[0]:g}, {limits[1]:g}] leaves no room for {moves.TEST_DISTANCE_M * 1e3:g} mm."
+            )
+        return distance
 
     def _encoder_resolution(self, name: str) -> float:
         return 1.0 / self._config.drives.each[NAMES.index(name)].counts_per_metre
