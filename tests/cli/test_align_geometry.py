@@ -17,6 +17,8 @@ import pytest
 import warm
 from alignment.cameras import FIELD as FIELD_PX
 from alignment.cameras import BuiltStage, wide_camera
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.geometry_calibration import GeometryCalibration, GeometryTask, calibrate_geometry
 from trirail.alignment.images import CameraView, project_points
@@ -32,6 +34,8 @@ from trirail.kinematics.correction import Correction
 from trirail.kinematics.geometry import LEGS
 from trirail.kinematics.robot import forward
 from trirail.wire.state import State
+from trirail_drivers.driver import scaling
+from trirail_drivers.interface import Triple
 
 MARKS = """
 import json, sys
@@ -190,6 +194,42 @@ def test_only_the_geometry_and_the_scales_change_in_the_file(name: str) -> None:
     assert written.limits == parse(text).limits
     comments = [line for line in text.splitlines() if line.startswith("#")]
     assert all(line in config_edit.edit_geometry(text, built, (0.0, 0.0, 0.0), None) for line in comments)
+
+
+OFFSETS = st.one_of(st.just(0.0), st.floats(-0.5, 0.5), st.floats(-90.0, 90.0))
+
+
+@pytest.mark.parametrize("name", ["uvw.toml", "uvw-ppr.toml", "xxy.toml", "sim.toml"])
+@given(
+    offsets=st.tuples(*[OFFSETS] * 3),
+    directions=st.tuples(*[st.sampled_from((1, -1))] * 3),
+    scales=st.tuples(*[st.one_of(st.just(0.0), st.floats(-0.01, 0.01))] * 3),
+    seed=st.integers(0, 100),
+)
+@example(offsets=(0.05, -0.02, 0.0), directions=(1, -1, 1), scales=(1e-4, -2e-4, 1e-4), seed=1)
+@settings(max_examples=10)
+def test_a_drive_reads_the_fitted_positions_with_the_file_that_is_written(
+    name: str, offsets: Triple, directions: Triple, scales: Triple, seed: int
+) -> None:
+    rng, text = np.random.default_rng(seed), SIM.with_name(name).read_text(encoding="utf-8")
+    changes: dict[str, int | float] = {}
+    for axis, offset, direction in zip(LEGS, offsets, directions, strict=True):
+        changes |= {f"drives.{axis}.direction": direction} | ({f"drives.{axis}.offset": offset} if offset else {})
+    old = parse(text := config_edit.edit_text(text, changes))
+    built = built_otherwise(geometry(old.geometry), rng, 1e-6, 1e-6)  # larger errors can move a singular angle
+    new = parse(config_edit.edit_geometry(text, built, scales, None))
+    positions = np.array([rng.uniform(low, high, 9) for low, high in old.limits.slider.positions])
+    readings, fitted = np.empty((2, 3, 9))
+    for i, (axis, before, after) in enumerate(zip(LEGS, old.drives.each, new.drives.each, strict=True)):
+        counts = [scaling.scale_of(axis, before).counts(position) for position in positions[i].tolist()]
+        readings[i] = [scaling.scale_of(axis, after).metres(each) for each in counts]
+        fitted[i] = [(1.0 + scales[i]) * scaling.scale_of(axis, before).metres(each) for each in counts]
+        assert after.direction == before.direction
+        assert (after.offset == 0.0) is (before.offset == 0.0)
+    assert readings == pytest.approx(fitted, abs=1e-9, rel=0.0)
+    # The file has the coordinates and angles of the legs to a nanometre and a nanoradian.
+    poses = forward(geometry(new.geometry), readings.T)
+    assert poses == pytest.approx(forward(built, fitted.T), abs=1e-7, rel=0.0)
 
 
 def test_a_map_of_the_old_geometry_is_left_out_and_another_may_take_its_place() -> None:

@@ -86,8 +86,8 @@ class GeometryCalibration(NamedTuple):
 
     geometry: Geometry
     scales: Triple
-    """Real travel of each slider per metre of encoder reading, minus 1. Divide counts_per_metre by 1 plus this
-    value."""
+    """Real position of each slider per metre of its reading, minus 1. Divide counts_per_metre by 1 plus this value, and
+    multiply offset by it."""
     parameters: dict[str, float]
     """Corrections to the configured values [m, rad, 1], with names such as "A rail_angle"."""
     deviations: dict[str, float]

@@ -50,9 +50,10 @@ def _without_map(text: str) -> Config:
 def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | None) -> str:
     """Return a configuration's text with the legs of `robot`, corrected encoder scales, and another correction map.
 
-    Each slider moves by (1 + scale) metres for each metre that its encoder counts. The correction map of the old
-    geometry is removed. `map_file` is the name of a new correction map; None for no map. Raises ConfigError if the
-    result is not a valid configuration, or if any other value has changed.
+    The real position of each slider is (1 + scale) times its reading. The reading contains the offset of the drive. If
+    there is an offset, it is therefore corrected too. The correction map of the old geometry is removed. `map_file` is
+    the name of a new correction map; None for no map. Raises ConfigError if the result is not a valid configuration, or
+    if any other value has changed.
     """
     document = tomlkit.parse(text)
     if "correction" in document:
@@ -72,13 +73,15 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
         for row in rows:
             legs.append(tomlkit.item(row))
         section["leg"] = legs
-    counts = {
-        f"drives.{name}.counts_per_metre": float(f"{drive.counts_per_metre / (1.0 + scale):.10g}")
-        for name, drive, scale in zip(NAMES, before.drives.each, scales, strict=True)
-    }
-    result = edit_text(tomlkit.dumps(document), counts)
+    axes: dict[str, float] = {}
+    for name, drive, scale in zip(NAMES, before.drives.each, scales, strict=True):
+        # With twelve digits, the readings are exact to 0.1 nm even if the offset is 100 m, the largest that is allowed.
+        axes[f"drives.{name}.counts_per_metre"] = float(f"{drive.counts_per_metre / (1.0 + scale):.12g}")
+        if drive.offset * scale:
+            axes[f"drives.{name}.offset"] = float(f"{drive.offset * (1.0 + scale):.12g}")
+    result = edit_text(tomlkit.dumps(document), axes)
     after = parse(result)
-    expected = msgspec.structs.replace(replace_values(before, counts), geometry=after.geometry)
+    expected = msgspec.structs.replace(replace_values(before, axes), geometry=after.geometry)
     if after != expected or geometry_of(geometry(after.geometry)) != geometry_of(robot):
         raise ConfigError("the new geometry cannot be written to this file; edit it by hand")
     if map_file is None:
