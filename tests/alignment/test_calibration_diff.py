@@ -6,14 +6,16 @@ import math
 
 import msgspec
 import numpy as np
+import pytest
 from alignment.cameras import Stage, camera, part_at
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.alignment.calibration_diff import ViewChange, compare_views
 from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.images import CameraView, Pair
-from trirail.alignment.procedure import calibrate_by_moves, calibration_moves, repeat_calibration
+from trirail.alignment.procedure import StageMotion, calibrate_by_moves, calibration_moves, repeat_calibration
 from trirail.alignment.rigid_motion import rotation_matrix
+from trirail_drivers.interface import Triple
 
 PART: dict[str, Pair] = {"left": (-0.06, 0.01), "right": (0.06, 0.01)}
 seeds = st.integers(0, 2**32 - 1)
@@ -108,3 +110,87 @@ def test_views_that_are_in_one_alone_are_left_out() -> None:
     both = Stage(views, PART, rng).drive(calibrate_by_moves())
     one = Stage(views, {"left": PART["left"]}, rng).drive(calibrate_by_moves())
     assert [each.view for each in compare_views(both, one)] == ["left"]
+
+
+class LooseStage(Stage):
+    """A stage with backlash: the table follows its commanded pose only after a reversal has crossed the play."""
+
+    def __init__(self, rng: np.random.Generator, play: Triple, views: dict[str, CameraView]) -> None:
+        super().__init__(views, PART, rng, noise=0.1)
+        self.table, self._half = np.zeros(3), np.abs(play) / 2.0
+        self.visited: list[Triple] = []
+
+    @property
+    def true_pose(self) -> Triple:
+        x, y, phi = self.table.tolist()
+        return x, y, phi
+
+    def go(self, motion: StageMotion) -> None:
+        if motion.approach is not None:
+            x, y, phi = np.add(motion.by, motion.approach).tolist()
+            self._go_to(motion._replace(by=(x, y, phi)))
+        by = motion.by if motion.tool is None or motion.approach is None else np.negative(motion.approach).tolist()
+        self._go_to(motion._replace(by=(by[0], by[1], by[2])))
+
+    def _go_to(self, motion: StageMotion) -> None:
+        super().go(motion)
+        self.visited.append(self.pose)
+        self.table = np.clip(self.table, self.pose - self._half, self.pose + self._half)
+
+
+def loose_stage(seed: int, play: float) -> LooseStage:
+    rng = np.random.default_rng(seed)
+    return LooseStage(rng, (play, play, 10.0 * play), {name: camera(rng, place) for name, place in PART.items()})
+
+
+@given(seeds, st.floats(5e-5, 1e-4), st.sampled_from(((1, 1, 1), (-1, 1, 1), (1, -1, -1), (-1, -1, -1))))
+def test_a_check_of_a_stage_with_backlash_arrives_from_the_side_of_the_calibration(
+    seed: int, play: float, side: tuple[int, int, int]
+) -> None:
+    stage = loose_stage(seed, play)
+    approach = side[0] * 3e-4, side[1] * 3e-4, side[2] * 3e-3
+    kept: CameraCalibration = stage.drive(calibrate_by_moves(looks=4, approach=approach))
+    assert kept.approach == approach
+    again: CameraCalibration = stage.drive(repeat_calibration(kept, 4))
+    assert again.approach == approach
+    assert again.noise < 0.25, "the play is not in the pictures"
+    assert not any(each.is_changed for each in compare_views(kept, again))
+    left = stage.views["left"]
+    stage.views["left"] = msgspec.structs.replace(left, origin=(left.origin[0] + 2e-4, left.origin[1]))
+    changes = compare_views(kept, stage.drive(repeat_calibration(kept, 4)))
+    assert [each.is_shifted for each in changes] == [True, False]
+
+
+POSES = st.tuples(st.floats(-2e-3, 2e-3), st.floats(-2e-3, 2e-3), st.floats(-0.02, 0.02))
+
+
+@given(seeds, POSES, POSES, st.one_of(st.none(), st.just((2e-4, -2e-4, 2e-3))))
+def test_a_check_visits_the_poses_of_the_calibration_wherever_it_begins(
+    seed: int, made: Triple, begun: Triple, approach: Triple | None
+) -> None:
+    """Moves over nearly the whole travel leave the limits if they are made around another pose."""
+    stage = loose_stage(seed, 0.0)
+    stage.pose, stage.table = made, np.array(made)
+    kept = stage.drive(calibrate_by_moves(approach=approach))
+    low, high = np.min(stage.visited, axis=0), np.max(stage.visited, axis=0)
+    stage.pose, stage.table, stage.visited = begun, np.array(begun), []
+    again = stage.drive(repeat_calibration(kept))
+    assert np.array(again.poses) == pytest.approx(np.array(kept.poses), abs=1e-12)
+    assert stage.pose == pytest.approx(begun, abs=1e-12), "the stage is where it was"
+    visited = np.array(stage.visited[1:-1])  # without the begin and the end, where the stage stood
+    assert (visited >= low - 1e-12).all()
+    assert (visited <= high + 1e-12).all()
+
+
+def test_a_calibration_of_an_earlier_version_has_no_approach() -> None:
+    kept = loose_stage(1, 0.0).drive(calibrate_by_moves(approach=(1e-4, 1e-4, 1e-3)))
+    fields = msgspec.to_builtins(kept)
+    assert msgspec.convert(fields, CameraCalibration).approach == kept.approach
+    del fields["approach"]
+    assert msgspec.convert(fields, CameraCalibration) == msgspec.structs.replace(kept, approach=None)
+
+
+def test_an_approach_of_other_numbers_can_be_written() -> None:
+    approach = np.array((1e-4, 1e-4, 1e-3), dtype=np.float64)
+    kept = loose_stage(1, 0.0).drive(calibrate_by_moves(approach=approach))  # type: ignore[arg-type]
+    assert msgspec.json.decode(msgspec.json.encode(kept), type=CameraCalibration).approach == (1e-4, 1e-4, 1e-3)

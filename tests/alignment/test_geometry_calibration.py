@@ -21,7 +21,7 @@ from trirail.alignment.geometry_calibration import (
 )
 from trirail.alignment.images import Lens, Pair, project_points
 from trirail.alignment.pose_plan import choose_poses, find_candidates
-from trirail.alignment.procedure import AlignmentTask, align
+from trirail.alignment.procedure import AlignmentTask, StageMotion, align, repeat_calibration
 from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.stage_model import StageLook, StageModel
 from trirail.client.stage_as_built import built_otherwise
@@ -269,6 +269,32 @@ def test_impossible_arguments_are_refused_before_a_move(change: dict[str, object
     with pytest.raises(RefusedError, match=words):
         made.drive(calibrate_geometry(task._replace(**change)))  # type: ignore[arg-type]
     assert made.motions == 0
+
+
+@pytest.mark.parametrize("name", sorted(STAGES))
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_cameras_are_checked_within_the_travel_from_wherever_the_stage_stands(name: str, side: float) -> None:
+    made, task = stage(name, 5)
+    task = task._replace(approach=(2e-4, 2e-4, 1e-3))
+    found = made.drive(calibrate_geometry(task))
+    assert found.cameras.approach == task.approach
+    made.pose = begun = (side * 8e-4, side * 6e-4, 0.0)
+    visited: list[Floats] = []
+    go = made.go
+
+    def watched(motion: StageMotion) -> None:
+        go(motion)
+        visited.append(np.array(made.pose))
+        if motion.approach is not None:
+            visited.append(np.add(made.pose, motion.approach))
+
+    made.go = watched  # type: ignore[method-assign]
+    again = made.drive(repeat_calibration(found.cameras))
+    assert again.approach == task.approach
+    assert made.pose == begun
+    poses = np.array(visited)
+    assert ((poses >= task.room.low) & (poses <= task.room.high)).all()
+    assert task.room.holds(travels(task.start, poses)).all()
 
 
 def test_marks_that_do_not_move_and_a_field_without_marks_are_refused() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Mapping, Sequence
 
+from msgspec import structs
 from trirail_drivers.interface import Triple
 
 from trirail.alignment import arguments
@@ -80,7 +81,7 @@ def calibrate_by_moves(
     yield StageMotion(first.pose, approach=approach)
     samples = [CalibrationSample(each.pose, each.marks) for each in observations]
     try:
-        calibration = calibrate(samples, views, lens, centre, looks)
+        calibration = structs.replace(calibrate(samples, views, lens, centre, looks), approach=plain_approach(approach))
     except AlignmentError as error:
         yield LookReport("calibration", end=error.fault, words=str(error))
         raise
@@ -91,14 +92,30 @@ def calibrate_by_moves(
 def repeat_calibration(
     saved: CameraCalibration, looks: int = 1
 ) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
-    """Repeat a saved calibration: calibrate the same views with the same moves, relative to the current pose."""
+    """Repeat a saved calibration: calibrate the same views at the same poses, and move back to the current pose.
+
+    The poses may span nearly the whole travel. Only the saved ones are known to be within the limits, so they are not
+    shifted to the current pose. Each motion arrives from the same side as in the saved calibration.
+    """
+    start = (yield StageMotion(ZERO_OFFSET, PLATFORM_CENTRE)).pose
     x, y, phi = saved.poses[0]
+    yield StageMotion((x, y, phi))
     moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in saved.poses[1:]]
     views = {name: mark.view for name, mark in saved.marks.items()}
     lens = next(iter(saved.views.values())).lens
     # Each view has its own centre if the geometry of the stage was calibrated with it.
     centres = {name: view.centre for name, view in saved.views.items()}
-    return (yield from calibrate_by_moves(moves, views, lens, centres, looks))
+    calibration = yield from calibrate_by_moves(moves, views, lens, centres, looks, saved.approach)
+    yield StageMotion(start)
+    return calibration
+
+
+def plain_approach(approach: Triple | None) -> Triple | None:
+    """Return an approach with Python floats, which can be written to a file, whatever its numbers are."""
+    if approach is None:
+        return None
+    x, y, phi = map(float, approach)
+    return x, y, phi
 
 
 def _add(a: Triple, b: Triple) -> Triple:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from trirail_drivers.interface import Triple
 
 from trirail.alignment.images import CameraView, Lens, Pair, Points, project_points, project_with
 from trirail.alignment.rigid_motion import Floats, rotation_matrix
@@ -75,6 +76,9 @@ class CameraCalibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """True if a correction with this calibration has had the predicted effect. Otherwise, corrections are limited."""
     looks: int = 1
     """Number of pictures that were averaged in each look. `noise` is the noise of the average."""
+    approach: Triple | None = None
+    """Offset x, y [m], phi [rad] from which each motion arrived, as in StageMotion; None if the motions were direct, or
+    if an earlier version wrote the file without it."""
 
     @property
     def reach(self) -> float:

@@ -19,7 +19,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.alignment import arguments
 from trirail.alignment.alignment_request import AlignmentRequest, LookReport, Observation, StageMotion
-from trirail.alignment.calibration_procedure import DEFAULT_MOVES, PLATFORM_CENTRE, ZERO_OFFSET
+from trirail.alignment.calibration_procedure import DEFAULT_MOVES, PLATFORM_CENTRE, ZERO_OFFSET, plain_approach
 from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, MarkFit, fit_cameras
 from trirail.alignment.fresh_pictures import average, capture
 from trirail.alignment.images import Lens, Pair
@@ -353,7 +353,7 @@ def solve(
         _held_out(model, known, fit),
         fit.noise,
         picture_noise,
-        calibrated_cameras(model, fit, known, task.looks),
+        structs.replace(calibrated_cameras(model, fit, known, task.looks), approach=plain_approach(task.approach)),
         _outliers(fit, known),
         known,
         fit_residual_map(geometry, task.room, state, model.view_of, used) if is_systematic else None,

@@ -178,7 +178,8 @@ def check(
     distance_ppm
         Maximum difference between the distance of the marks and the distance of their targets [ppm].
     moves
-        Repeat the moves of the calibration, with any part, and compare the cameras with their state at that time.
+        Move to the poses of the calibration and back, with any part, and compare the cameras with their state at that
+        time.
     """
     from trirail.alignment.calibration_diff import compare_views
     from trirail.alignment.procedure import AlignmentTask, measure_part, repeat_calibration
