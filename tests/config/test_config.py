@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, get_args, get_origin
 
 import msgspec
+import numpy as np
 import pytest
 from conftest import Rig
 from hypothesis import assume, example, given, settings
@@ -32,6 +33,7 @@ from trirail.config import (
 from trirail.config.impossible import check
 from trirail.config.tables import LegTable
 from trirail.errors import ConfigError
+from trirail.kinematics.robot import forward, inverse
 from trirail.telemetry import provenance
 from trirail.wire.goals import PoseGoal
 from trirail.wire.vocabulary import Mode
@@ -189,6 +191,13 @@ def test_shipped_configurations_load(path: Path) -> None:
         ("x = [-0.15, 0.15]", "x = [0.1]", "limits.platform.x = [0.1]: expected array of length 2"),
         ("phi = [-1.2, 0.85]", "phi = [-1.2, 1.0]", "singular angle 1.0472; keep it within [-1.9443, 0.8971]"),
         ("phi = [-1.2, 0.85]", "phi = [-2.1, 0.8]", "singular angle -2.0944; keep it within [-1.9443, 0.8971]"),
+        (
+            "phi = [-1.2, 0.85]",
+            "phi = [1.3, 2.0]",
+            "beyond the singular angle 1.0472, where the pose cannot be computed",
+        ),
+        ("phi = [-1.2, 0.85]", "phi = [-4.5, -3.0]", "beyond the singular angle -2.0944, where"),
+        ("phi = [-1.2, 0.85]", "phi = [6.0, 6.2]", "from the sliders; keep it within [-1.9443, 0.8971]"),
         ("jerk = [40.0, 40.0, 300.0]", "jerk = [40.0, 0.0, 300.0]", "jerk[1] = 0.0: expected number, 0.001 to 1e+06"),
     ],
 )
@@ -607,3 +616,24 @@ def test_what_is_said_of_a_singular_angle_is_accepted(
     else:
         said = ""
     assert "singular angle" not in said
+
+
+@pytest.mark.parametrize("name", ["sim.toml", "uvw.toml", "uvw-ppr.toml", "xxy.toml"])
+@example(low=2.6, span=1.4, margin=0.1)
+@given(low=st.floats(-6.2, 6.2), span=st.floats(0.01, 4.0), margin=st.floats(0.01, 0.4))
+def test_the_pose_is_computed_right_from_the_sliders_wherever_a_platform_may_turn(
+    name: str, low: float, span: float, margin: float
+) -> None:
+    config = load(SIM.with_name(name))
+    phi = low, min(low + span, 6.28)
+    platform = msgspec.structs.replace(config.limits.platform, phi=phi)
+    limits = msgspec.structs.replace(config.limits, platform=platform, singularity_margin=margin)
+    try:
+        check(msgspec.structs.replace(config, limits=limits, poses={}))
+    except ConfigError as error:
+        if "singular angle" in str(error):
+            return
+    robot = geometry(config.geometry)
+    poses = np.zeros((20, 3))
+    poses[:, 2] = np.linspace(*phi, len(poses))
+    assert forward(robot, inverse(robot, poses).position) == pytest.approx(poses, abs=1e-7)

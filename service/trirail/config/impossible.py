@@ -132,26 +132,46 @@ def _size(config: Config) -> float:
 
 
 def _check_singular_angles(config: Config) -> None:
+    """Refuse a range of phi that is not between the nearest singular angles below and above zero.
+
+    For each position of the sliders there are two poses, with a singular angle between them. The measured pose is the
+    one on the same side as the pose (0, 0, 0). If the platform stood on the other side, it would be wrong.
+    """
     platform = config.limits.platform
     corrected = corrected_geometry(config)
     errors = corrected.correction
     x, y, phi = np.zeros(3) if errors is None else errors.bound  # the legs receive poses this far beyond the limits
-    (low, high), margin = (platform.phi[0] - phi, platform.phi[1] + phi), config.limits.singularity_margin
+    margin = config.limits.singularity_margin
+    low, high = platform.phi[0] - phi - margin, platform.phi[1] + phi + margin
     # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
     beside = [(low - more, high + more) for (low, high), more in ((platform.x, x), (platform.y, y))]
     centres = [(0.0, 0.0), *itertools.product(*beside)]
     robot = geometry(config.geometry)
-    singular = {angle for centre in centres for angle in singular_angles(robot, centre)}
-    for angle in singular:
-        if low - margin < angle < high + margin:
-            lowest = max(angle for angle in (-math.pi, *singular) if angle <= 0.0) + margin + phi
-            highest = min(angle for angle in (math.pi, *singular) if angle > 0.0) - margin - phi
-            # Both ends, over all corners, and rounded inwards: the range in the message is itself accepted.
+    singular = {
+        angle + turn
+        for centre in centres
+        for angle in singular_angles(robot, centre)
+        for turn in (-2.0 * math.pi, 0.0, 2.0 * math.pi)
+    }
+    below, above = max(angle for angle in singular if angle <= 0.0), min(angle for angle in singular if angle > 0.0)
+    if below <= low and high <= above:
+        return
+    # Both ends, over all corners, and rounded inwards: the range in the message is itself accepted.
+    lowest, highest = max(below, -math.pi) + margin + phi, min(above, math.pi) - margin - phi
+    first, last = math.ceil(lowest * 1e4 + 1e-6) * 1e-4, math.floor(highest * 1e4 - 1e-6) * 1e-4
+    remedy = f"keep it within [{first:.4f}, {last:.4f}]"
+    key = f"limits.platform.phi = [{platform.phi[0]:g}, {platform.phi[1]:g}]"
+    for angle in (below, above):
+        if low < angle < high:
             raise ConfigError(
-                f"limits.platform.phi = [{platform.phi[0]:g}, {platform.phi[1]:g}] is closer than "
-                f"limits.singularity_margin = {margin:g} to the singular angle {angle:.4f}; keep it within "
-                f"[{math.ceil(lowest * 1e4 + 1e-6) * 1e-4:.4f}, {math.floor(highest * 1e4 - 1e-6) * 1e-4:.4f}]"
+                f"{key} is closer than limits.singularity_margin = {margin:g} to the singular angle {angle:.4f}; "
+                f"{remedy}"
             )
+    beyond_angle = above if low >= above else below
+    raise ConfigError(
+        f"{key} is beyond the singular angle {beyond_angle:.4f}, where the pose cannot be computed from the sliders; "
+        f"{remedy}"
+    )
 
 
 def _check_settling(config: Config) -> None:

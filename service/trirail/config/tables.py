@@ -94,8 +94,8 @@ class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
     y: Range
     """Minimum and maximum y of the platform's centre [m]."""
     phi: tuple[Angle, Angle]
-    """Minimum and maximum angle of the platform [rad]. Both must be at least singularity_margin away from every
-    singular angle."""
+    """Minimum and maximum angle of the platform [rad]. Both must be between the nearest singular angles below and above
+    zero, at least singularity_margin away from each."""
 
 
 _THREE = Meta(min_length=3, max_length=3)
