@@ -153,7 +153,8 @@ def _check_singular_angles(config: Config) -> None:
         for angle in singular_angles(robot, centre)
         for turn in (-2.0 * math.pi, 0.0, 2.0 * math.pi)
     }
-    below, above = max(angle for angle in singular if angle <= 0.0), min(angle for angle in singular if angle > 0.0)
+    below = max((angle for angle in singular if angle <= 0.0), default=-math.inf)
+    above = min((angle for angle in singular if angle > 0.0), default=math.inf)
     if below <= low and high <= above:
         return
     # Both ends, over all corners, and rounded inwards: the range in the message is itself accepted.
