@@ -11,7 +11,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -143,12 +143,13 @@ class Page:
         self.press(selector)
         self.let_go(selector)
 
-    def drag(self, selector: str, right: float, up: float) -> None:
-        """Drag from the middle of an element by so many pixels."""
+    def drag(self, selector: str, right: float, up: float, while_held: Callable[[], object] = lambda: None) -> None:
+        """Drag from the middle of an element by a number of pixels; call `while_held` before the button is released."""
         at = self.middle(selector)
         self._mouse("mousePressed", at)
         for part in (0.5, 1.0):
             self._mouse("mouseMoved", {"x": at["x"] + part * right, "y": at["y"] - part * up})
+        while_held()
         self._mouse("mouseReleased", {"x": at["x"] + right, "y": at["y"] - up})
 
     def write(self, selector: str, words: str) -> None:

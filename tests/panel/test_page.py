@@ -265,6 +265,32 @@ def test_the_override_is_shown_and_set(enabled: Page, robot: FakeRobot) -> None:
     enabled.until("document.querySelector('#override').value === '80'")
 
 
+@pytest.mark.parametrize("right", [40.0, -40.0])
+def test_an_override_is_sent_however_long_the_slider_is_held(enabled: Page, robot: FakeRobot, right: float) -> None:
+    robot.share = 0.9
+    enabled.until("document.querySelector('#override').value === '90'")
+    values: list[str] = []
+
+    def hold() -> None:
+        values.append(enabled.evaluate("document.querySelector('#override').value"))
+        robot.share = 0.2  # set by another operator
+        enabled.evaluate("new Promise((later) => setTimeout(later, 1500))")
+        values.append(enabled.evaluate("document.querySelector('#override').value"))
+
+    enabled.drag("#override", right, 0.0, hold)
+    assert values[0] == values[1] != "90"
+    wait_until(lambda: robot.share == int(values[1]) / 100.0, "the value under the pointer is sent")
+
+
+def test_a_slider_that_was_held_shows_the_override_again(enabled: Page, robot: FakeRobot) -> None:
+    """Also if its value has not changed, and the mouse is released beside it."""
+    enabled.press("#override")
+    enabled.let_go("#mode-name")
+    for share in (0.45, 0.65):
+        robot.share = share
+        enabled.until(f"document.querySelector('#override').value === '{round(share * 100)}'")
+
+
 def test_named_poses_are_buttons_that_come_and_go_with_them(enabled: Page, robot: FakeRobot) -> None:
     names = "JSON.stringify([...document.querySelectorAll('#poses button')].map((button) => button.textContent))"
     enabled.until(f"{names} === '[\"park\"]'")

@@ -3,7 +3,7 @@
 import { barriers } from "./barriers.js";
 import { number, onLanguage, say, time } from "./words.js";
 
-const SETTING = 1000; // for so long the override's slider is the operator's, then it shows the robot's again [ms]
+const SETTING = 1000; // time after the operator's last change until the override's slider shows the robot's value again [ms]
 
 const byId = (id) => document.getElementById(id);
 
@@ -14,17 +14,27 @@ export class Commands {
     this.users = ""; // who is connected
     this.since = null; // since when who holds the lease, as events tell
     this.set = -Infinity; // when the override's slider was last moved by the operator
+    this.held = false; // whether the operator holds the override's slider, however long it stands still
     for (const button of document.querySelectorAll("[data-command]"))
       button.addEventListener("click", () => {
         const name = button.dataset.command;
         answer(say(`do.${name}`));
         send(name === "takeover" ? { do: name } : { do: "command", name });
       });
-    byId("override").addEventListener("input", (event) => {
+    const slider = byId("override");
+    slider.addEventListener("input", () => {
       this.set = performance.now();
-      showOverride(event.target.value);
+      showOverride(slider.value);
     });
-    byId("override").addEventListener("change", (event) => send({ do: "command", name: "override", content: { percent: Number(event.target.value) } }));
+    slider.addEventListener("change", () => send({ do: "command", name: "override", content: { percent: Number(slider.value) } }));
+    slider.addEventListener("pointerdown", () => (this.held = !slider.disabled));
+    const release = () => {
+      if (this.held) this.set = performance.now();
+      this.held = false;
+    };
+    for (const end of ["change", "blur"]) slider.addEventListener(end, release);
+    // A mouse may be released beside the slider.
+    for (const end of ["pointerup", "pointercancel"]) addEventListener(end, release, true);
     // A control that is disabled says why where it is pressed.
     document.addEventListener("pointerdown", ({ target }) => target.closest?.("button, input")?.disabled && note(target.closest("button, input").title), true);
     onLanguage(() => this.show());
@@ -65,7 +75,8 @@ export class Commands {
     text(byId("lease"), say(words, { user: lease, since }));
     byId("lease").className = words === "lease.held" ? "warning" : "";
     const percent = Math.round(override * 100);
-    if (performance.now() - this.set > SETTING) showOverride((byId("override").value = percent));
+    // A value that is written while the slider is held becomes the one from which the browser sees no change on release.
+    if (!this.held && performance.now() - this.set > SETTING) showOverride((byId("override").value = percent));
   }
 }
 
