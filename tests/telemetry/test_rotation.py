@@ -33,7 +33,7 @@ from trirail.telemetry.reading import join, read
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.recording import Recording
-from trirail.telemetry.rotation import RETRY
+from trirail.telemetry.rotation import RETRY, claim
 from trirail.telemetry.sessions import find, recorded
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
@@ -280,6 +280,26 @@ def test_parts_of_the_running_session_go_last_whatever_clocks_said(
         in_order = [*sorted(names, key=names.__getitem__), *parts]
         deleted = retention.tidy(folder, at_most * 1e6, session)
         assert [path.stem for path in deleted] == in_order[: max(0, len(in_order) - at_most)]
+
+
+def test_every_name_that_the_recorder_chooses_is_counted_and_deleted(tmp_path: Path) -> None:
+    """Sessions that begin in the same second have numbers, and so have parts whose name is in use."""
+    sessions = [claim(tmp_path, "demo-20260101-110000") for _ in range(2)]
+    names = [claim(tmp_path, f"{first.stem}-part{part}") for first in sessions for part in (2, 2, 10)]
+    in_order = [sessions[0], *names[:3], sessions[1], *names[3:]]
+    for path in in_order:
+        os.truncate(path, 1_000_000)
+    for left in reversed(range(len(in_order))):
+        (oldest,) = retention.tidy(tmp_path, left * 1e6)
+        assert oldest == in_order[-1 - left]
+
+
+def test_another_session_of_the_same_second_goes_before_the_running_one(tmp_path: Path) -> None:
+    running, other = (claim(tmp_path, "demo-20260101-110000") for _ in range(2))
+    part = claim(tmp_path, f"{running.stem}-part2")
+    for path in (running, other, part):
+        os.truncate(path, 1_000_000)
+    assert retention.tidy(tmp_path, 2e6, running.stem) == [other]
 
 
 def test_the_recorder_tidies_its_folder(tmp_path: Path) -> None:

@@ -17,8 +17,14 @@ from typing import NamedTuple
 
 BLACK_BOX = "fault-"
 """Prefix of the names of black boxes."""
-_NAME = re.compile(r"(?P<name>[A-Za-z0-9_-]+)-(?P<date>\d{8}-\d{6})(-part(?P<part>\d+))?(-(?P<again>\d+))?\.rrd")
-"""Pattern of the file names that the recorder chooses. Files with other names belong to users and are never deleted."""
+_NAME = re.compile(
+    r"(?P<session>(?P<name>[A-Za-z0-9_-]+)-(?P<date>\d{8}-\d{6})(-(?P<number>\d+))?)"
+    r"(-part(?P<part>\d+)(-(?P<again>\d+))?)?\.rrd"
+)
+"""Pattern of the file names that the recorder chooses. Files with other names belong to users and are never deleted.
+
+The session and each part have a number if their name without it was in use.
+"""
 
 
 def sidecar(recording: Path) -> Path:
@@ -29,10 +35,10 @@ def sidecar(recording: Path) -> Path:
 class _StoredRecording(NamedTuple):
     path: Path
     size: int
-    order: tuple[bool, bool, str, str, int, int]
+    order: tuple[bool, bool, str, str, int, int, int]
     """Sort key in the order of deletion.
 
-    Recordings are sorted by date, part and number in their names, the running session after all others, and black boxes
+    Recordings are sorted by date, number and part in their names, the running session after all others, and black boxes
     last.
     """
 
@@ -113,6 +119,7 @@ def _recordings(directory: Path, session: str) -> Iterator[_StoredRecording]:
             size = path.stat().st_size + (log.stat().st_size if log.exists() else 0)
         except FileNotFoundError:
             continue
-        name, date, part, again = match["name"], match["date"], int(match["part"] or 1), int(match["again"] or 1)
-        own = session != "" and path.stem.startswith(session)
-        yield _StoredRecording(path, size, (f"{name}-" == BLACK_BOX, own, date, name, part, again))
+        name, date = match["name"], match["date"]
+        number, part, again = (int(match[key] or 1) for key in ("number", "part", "again"))
+        own = match["session"] == session
+        yield _StoredRecording(path, size, (f"{name}-" == BLACK_BOX, own, date, name, number, part, again))
