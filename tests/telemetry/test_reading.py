@@ -177,6 +177,34 @@ def test_every_length_of_the_last_message_is_survived(tmp_path: Path) -> None:
         assert [line.text for line in recording.events] == ["the last line"] * (length == len(after))
 
 
+@settings(max_examples=40)
+@given(data=st.data(), cut=st.integers(0, 3 << 20), unaligned=st.booleans())
+def test_an_end_of_nul_bytes_leaves_the_records_before_it(
+    file_left_open: bytes, data: st.DataObject, cut: int, unaligned: bool
+) -> None:
+    """After a power cut, a file may have its new size but only NUL bytes from some point on."""
+    start = data.draw(st.integers(len(file_left_open) // 2, len(file_left_open)))
+    start -= 0 if unaligned else start % 512
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.rrd")
+        path.write_bytes(file_left_open[:start] + bytes(len(file_left_open) - start + cut))
+        records = read(path).records
+    sent = made.records(2.0)
+    assert made.bits(records) == made.bits(sent[: len(records)])
+    assert len(records) / len(sent) > start / len(file_left_open) - 0.2
+
+
+@pytest.fixture(scope="module")
+def file_left_open(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Content of a recording whose recorder did not close it."""
+    path = tmp_path_factory.mktemp("open") / "a.rrd"
+    recorder = written(path, made.records(2.0), close=False)
+    recorder.save()
+    content = path.read_bytes()
+    recorder.close()
+    return content
+
+
 # ---------------------------------------------------------------------- what is refused
 
 

@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, TypeVar
 
 import msgspec
 import numpy as np
@@ -45,7 +45,11 @@ _FILE_HEADER = 12
 _MESSAGE_HEADER = struct.Struct("<QQ")
 """Header of each message: the kind of the message, and the number of bytes that follow the header."""
 _END = 0
-"""Kind of the last message of a properly closed file. Only a table of contents follows this message."""
+"""Kind of the last message of a properly closed file. Its content is a table of contents, so it is never empty."""
+_LAST_NULS = 1
+"""Number of NUL bytes with which a complete message can end: its last field is the flag of static data."""
+_BLOCK = 1 << 20
+"""Number of bytes read at a time in the search for the end of the data."""
 
 _LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
@@ -160,20 +164,38 @@ def _without_partial_message(path: Path, *, growing: bool = False) -> Iterator[P
 
 
 def _complete_length(path: Path) -> int:
-    """Return the length of a file up to its last complete message [bytes]; for a closed file, its whole length."""
+    """Return the length of a file up to its last complete message [bytes]; for a closed file, its whole length.
+
+    After a power cut, the end of a file can consist of NUL bytes: the file system has stored the new size, but not yet
+    the data. A message that extends into these bytes is not complete.
+    """
     with files.open_regular(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
         size, end = os.fstat(file.fileno()).st_size, _FILE_HEADER
+        filled = min(size, _filled_length(file, size) + _LAST_NULS)
         while end + _MESSAGE_HEADER.size <= size:
             file.seek(end)
             kind, length = _MESSAGE_HEADER.unpack(file.read(_MESSAGE_HEADER.size))
-            if end + _MESSAGE_HEADER.size + length > size:
-                break
-            if kind == _END:
+            if kind == _END and length and end + _MESSAGE_HEADER.size + length <= size:
                 return size
+            if end + _MESSAGE_HEADER.size + length > filled:
+                break
             end += _MESSAGE_HEADER.size + length
     return end
+
+
+def _filled_length(file: BinaryIO, size: int) -> int:
+    """Return the length of a file without the NUL bytes at its end [bytes]."""
+    end = size
+    while end > 0:
+        start = max(0, end - _BLOCK)
+        file.seek(start)
+        block = file.read(end - start).rstrip(b"\0")
+        if block:
+            return start + len(block)
+        end = start
+    return 0
 
 
 def _chunks(whole: Path, path: Path) -> list[Chunk]:
