@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shlex
@@ -152,6 +153,61 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         found = json.loads(out)
         assert found["ok"] is False
         assert said in found["message"]
+
+
+NO_FILE = "n" * 300
+"""Name that no file can have: the operating system refuses to look for it."""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"view {NO_FILE}",
+        f"sessions {NO_FILE}",
+        f"report {NO_FILE}",
+        f"replay {NO_FILE}",
+        f"export {NO_FILE}",
+        f"run {NO_FILE}",
+        f"doctor {NO_FILE} --quick",
+        f"follow {NO_FILE}",
+        f"config show {NO_FILE}",
+        f"ik 0 0 0 --config {NO_FILE}",
+        f"panel --token {NO_FILE}",
+    ],
+)
+def test_an_error_of_the_operating_system_is_one_line_with_the_file_and_the_reason(line: str, run: Run) -> None:
+    for words in (line.split(), [*line.split(), "--json"]):
+        code, out, err = run(*words)
+        if code == 2 and "--json" in words:  # not a command with this option
+            continue
+        said = json.loads(out)["message"] if "--json" in words and out else err
+        assert code == 1
+        assert f"{NO_FILE[:200]}" in said
+        assert "File name too long" in said
+        assert (out + err).count("\n") == 1
+
+
+def test_a_folder_that_cannot_be_read_is_not_an_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
+) -> None:
+    def refuse(folder: str) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+
+    for function in ("listdir", "scandir"):
+        monkeypatch.setattr(os, function, refuse)
+    assert run("sessions", str(tmp_path)) == (1, "", f"trirail: {tmp_path}: Permission denied\n")
+
+
+@pytest.mark.parametrize("line", ["fk 0 0 0", "fk 0 0 0 --json", "fk 9 9 9 --json", "help all"])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_output_to_a_full_disk_is_an_error_in_one_line(line: str, unbuffered: str) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "trirail", *line.split()], stdout=full, stderr=subprocess.PIPE, text=True,
+            env=os.environ | {"PYTHONUNBUFFERED": unbuffered}, check=False,
+        )  # fmt: skip
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert ("out of reach" if " 9 " in line else "No space left on device") in done.stderr
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import shutil
 import subprocess
@@ -224,6 +225,21 @@ def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
         with pytest.raises(ServiceError, match=f"^{re.escape(str(path))}: {why}") as raised:
             read(path)
         assert "\n" not in str(raised.value)
+
+
+def test_a_file_that_the_operating_system_refuses_is_refused_with_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / ("n" * 300)
+    with pytest.raises(ServiceError, match=f"{path}: File name too long"):
+        read(path)
+
+    def refuse(path: Path, **_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "stat", refuse)
+    with pytest.raises(ServiceError, match="Permission denied"):
+        read(tmp_path / "a.rrd")
 
 
 def test_a_recording_without_records_is_told_as_what_it_is(tmp_path: Path) -> None:

@@ -308,10 +308,7 @@ def main() -> None:
         terminal.print_error(_wrong_usage(error, words))
         code = 2
     except TrirailError as error:
-        if "--json" in words:
-            terminal.print_error_json(error)
-        else:
-            terminal.print_error(str(error))
+        _print_failure(error, words)
         code = 1
     except KeyboardInterrupt:
         code = 130
@@ -320,7 +317,41 @@ def main() -> None:
     except BrokenPipeError:  # the reader, such as head, has closed the pipe
         sys.stderr.close()
         code = 0
+    except OSError as error:
+        _print_system_error(error, words)
+        code = 1
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _print_failure(error: TrirailError, words: list[str]) -> None:
+    """Print why a command failed, as one line or, with --json, as one JSON object."""
+    if "--json" in words:
+        try:
+            terminal.print_error_json(error)
+        except OSError:
+            _discard_output()
+        else:
+            return
+    terminal.print_error(str(error))
+
+
+def _print_system_error(error: OSError, words: list[str]) -> None:
+    """Print an error of the operating system like other errors, with the name of the file if it is known."""
+    reason = error.strerror or str(error)
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _discard_output()
+        terminal.print_error(f"standard output: {reason}")
+        return
+    is_named = isinstance(error.filename, str | bytes) and error.filename
+    _print_failure(TrirailError(f"{os.fsdecode(error.filename)}: {reason}" if is_named else reason), words)
+
+
+def _discard_output() -> None:
+    """Discard the output that cannot be written. Python would try again at its end, and exit with 120."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _wrong_usage(error: CycloptsError, words: list[str]) -> str:

@@ -86,12 +86,12 @@ def read(path: str | os.PathLike[str]) -> Recording:
         The recording lacks fields that were added later. Those fields are NaN, or 0 if they are not floats.
     """
     path = Path(path)
-    size = path.stat().st_size if path.is_file() else 0
+    size = _size(path)
     try:
         with _without_partial_message(path) as whole:
             chunks = _chunks(whole, path)
     except ServiceError:
-        if not path.is_file() or path.stat().st_size == size:
+        if _size(path) == size:
             raise
         with _without_partial_message(path, growing=True) as whole:  # the file was being written while Rerun read it
             chunks = _chunks(whole, path)
@@ -135,6 +135,14 @@ def join(parts: Sequence[Recording]) -> Recording:
         texts=first.texts,
         requests=tuple(sorted((item for part in parts for item in part.requests), key=lambda item: item.seq)),
     )
+
+
+def _size(path: Path) -> int | None:
+    """Return the size of a file [bytes]; None if the file is missing or its folder cannot be searched."""
+    try:
+        return path.stat().st_size
+    except (OSError, ValueError):
+        return None
 
 
 @contextmanager

@@ -67,9 +67,15 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
         sidecar.
     on_read
         Function called with each recording before it is read.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be listed.
     """
     listed = []
-    for path in sorted(folder.glob("*.rrd"), key=lambda path: path.name):
+    found = [path for path in folder.iterdir() if path.suffix == ".rrd"]  # glob would skip a folder that is unreadable
+    for path in sorted(found, key=lambda path: path.name):
         known = contents.load(path)
         if known is None or known.running or reread:
             try:
