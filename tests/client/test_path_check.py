@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
+import msgspec
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.client.path_check import CheckedPath, check_path, find_obstacle
 from trirail.config import SIM, FramesTable, load
+from trirail.motion.limits import Bounds
 from trirail.motion.runs import centre_motion, rest
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.workspace.violations import violations
@@ -17,6 +20,7 @@ TIP, TABLE = (0.02, 0.03), (0.05, 0.02, 0.3)
 FRAMES = FramesTable(tool={"tip": TIP}, work={"table": TABLE})
 CONFIGURED = DrawnRobot.from_config(load(SIM))
 ROBOT = DrawnRobot(CONFIGURED.name, CONFIGURED.geometry, CONFIGURED.limits, CONFIGURED.rate_hz, FRAMES)
+BOUNDS = Bounds(ROBOT.limits, 1.0 / ROBOT.rate_hz)
 ZERO = (0.0, 0.0, 0.0)
 place = st.floats(-0.2, 0.2)
 
@@ -32,10 +36,34 @@ def test_a_pose_that_is_out_of_reach_is_never_called_free(
     of_point = x + c * pose[0] - s * pose[1], y + s * pose[0] + c * pose[1], angle + pose[2]
     centre = centre_motion(rest(of_point), TIP if tool else (0.0, 0.0)).pose
     found = find_obstacle(ROBOT, ZERO, pose, tool, frame)
-    reached = not violations(ROBOT.geometry, ROBOT.limits, np.array(centre))
-    assert reached or (found and not found.on_way)
+    permitted = not violations(ROBOT.geometry, ROBOT.limits, np.array(centre)) and not BOUNDS.pose_violation(centre)
+    assert permitted or (found and not found.on_way)
     assert find_obstacle(ROBOT, ZERO, pose, "no such", frame)
     assert find_obstacle(ROBOT, ZERO, pose, tool, "no such")
+
+
+@given(st.sampled_from(range(3)), st.sampled_from([-1.0, 1.0]), st.floats(1e-6, 0.02))
+def test_a_limit_of_the_platform_is_an_obstacle_with_its_values(axis: int, sign: float, beyond: float) -> None:
+    """Narrower than the reach of the robot, so that no other limit is exceeded first."""
+    platform = msgspec.structs.replace(CONFIGURED.limits.platform, x=(-0.05, 0.05), y=(-0.04, 0.04), phi=(-0.3, 0.2))
+    limits = msgspec.structs.replace(CONFIGURED.limits, platform=platform)
+    robot = dataclasses.replace(ROBOT, limits=limits)
+    low, high = (platform.x, platform.y, platform.phi)[axis]
+    limit = high if sign > 0.0 else low
+    pose = [0.0, 0.0, 0.0]
+    pose[axis] = limit + sign * beyond
+    outside = (pose[0], pose[1], pose[2])
+    found = find_obstacle(robot, ZERO, outside, None, "base")
+    assert found is not None
+    assert (found.on_way, found.code, found.what) == (False, "platform_position", "xyφ"[axis])
+    assert (found.value, found.limit, found.unit) == (pose[axis], limit, "m" if axis < 2 else "rad")
+    pose[axis] = limit
+    inside = (pose[0], pose[1], pose[2])
+    assert find_obstacle(robot, ZERO, inside, None, "base") is None
+    # A robot beyond the limit may return, and stay, but not move farther out.
+    assert find_obstacle(robot, outside, inside, None, "base") is None
+    pose[axis] += 2.0 * sign * beyond
+    assert find_obstacle(robot, outside, (pose[0], pose[1], pose[2]), None, "base")
 
 
 rows = st.lists(st.lists(st.one_of(st.floats(-2.0, 2.0).map(str), st.text(max_size=5)), max_size=6).map(",".join))

@@ -395,7 +395,7 @@ def test_a_pose_that_is_typed_is_checked_and_gone_to_when_told(
 def test_what_is_in_the_way_is_said_before_anything_moves(enabled: Page) -> None:
     typed(enabled, "500", "0", "0")
     enabled.until("document.querySelector('#going').dataset.may === 'no'")
-    assert "slider" in enabled.text("#going-says")
+    assert "platform x: position 500 mm" in enabled.text("#going-says")
     enabled.until_equal("document.querySelector('.wanted').parentElement.getAttribute('class')", "barred")
 
 

@@ -15,6 +15,7 @@ from trirail.client import trajectory
 from trirail.client.outgoing import goal_messages
 from trirail.errors import KinematicsError, RefusedError, TrirailError
 from trirail.motion.goal_planner import GoalPlanner
+from trirail.motion.limits import Bounds, Violation
 from trirail.motion.runs import centre_motion, nominal_motion, rest, tool_motion
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames, rotated
@@ -25,6 +26,8 @@ from trirail.workspace.violations import violations
 
 CHECKED_POSES = 40
 """Number of poses that are checked on the straight line in pose space, from its end to its start."""
+SYMBOLS = {"phi": "φ"}
+"""Symbols of the platform's coordinates on the page, where they differ from the name."""
 DRAWN_POINTS = 200
 """Number of points with which a path is drawn, evenly spaced in time."""
 
@@ -38,7 +41,7 @@ class Obstacle(Struct, frozen=True, omit_defaults=True):
     code: str = ""
     """Name of the exceeded limit, "unreachable", or a RefusalCode."""
     what: str = ""
-    """Label of the slider."""
+    """Label of the slider, or symbol of the platform's coordinate."""
     value: float = 0.0
     limit: float = 0.0
     unit: str = ""
@@ -47,8 +50,10 @@ class Obstacle(Struct, frozen=True, omit_defaults=True):
 def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | None, frame: str) -> Obstacle | None:
     """Check if the tool can move along a straight line in pose space; CHECKED_POSES poses are checked.
 
-    The function checks positions, passive travel and the singularity margin. Only the service checks the speeds, and
-    the path between the checked poses.
+    The function checks positions, passive travel, the limits of the platform and the singularity margin. Only the
+    service checks the speeds, and the path between the checked poses.
+
+    As in the service, a robot beyond a limit of the platform may move, if it moves no farther beyond that limit.
 
     Parameters
     ----------
@@ -73,19 +78,27 @@ def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | No
         point, (x, y, angle) = names.tool(tool), names.frame(frame)
     except RefusedError as error:
         return Obstacle(str(error), code=error.code)
+    bounds = Bounds(robot.limits, 1.0 / robot.rate_hz, labels=robot.geometry.labels)
     u, v = rotated(end[0], end[1], angle)
     first, last = np.array(tool_motion(rest(start), point).pose), np.array((x + u, y + v, angle + end[2]))
     for share in np.linspace(1.0, 0.0, CHECKED_POSES, endpoint=False):
         pose = centre_motion(rest((share * last + (1.0 - share) * first).tolist()), point).pose
+        if outside := bounds.pose_violation_from(pose, start):
+            return _obstacle(outside, bool(share < 1.0))
         try:
             exceeded = violations(robot.geometry, robot.limits, np.asarray(pose))
         except KinematicsError as error:
             return Obstacle(str(error), bool(share < 1.0), "unreachable", error.leg)
         if exceeded:
-            least = exceeded[0]
-            code = least.quantity.replace(" ", "_")
-            return Obstacle(str(least), bool(share < 1.0), code, least.label, least.value, least.limit, least.unit)
+            return _obstacle(exceeded[0], bool(share < 1.0))
     return None
+
+
+def _obstacle(exceeded: Violation, on_way: bool) -> Obstacle:
+    code, what = exceeded.quantity.replace(" ", "_"), exceeded.label
+    if exceeded.part == "platform" and code == "position":
+        code, what = "platform_position", SYMBOLS.get(exceeded.axis, exceeded.axis)
+    return Obstacle(str(exceeded), on_way, code, what, exceeded.value, exceeded.limit, exceeded.unit)
 
 
 class CheckedPath(Struct, frozen=True, omit_defaults=True):
