@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import msgspec
 import numpy as np
 import pytest
 import yourdfpy
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
@@ -153,3 +156,41 @@ def test_urdf_goes_to_a_file_or_to_the_terminal(tmp_path: Path, capsys: pytest.C
     assert capsys.readouterr().out.endswith(path.read_text(encoding="utf-8"))
     with pytest.raises(ServiceError, match="already exists"):
         recording_commands.urdf(out=path)
+
+
+def test_the_memory_of_an_export_does_not_grow_with_the_recording(recording: Recording) -> None:
+    geometry = config.geometry(load(SIM).geometry)
+
+    def peak(times: int) -> int:
+        records, wall = np.tile(recording.records, times), np.tile(recording.wall, times)
+        wall += np.arange(len(wall)) // len(recording.wall) * np.timedelta64(1, "s")
+        repeated = recording._replace(records=records, wall=wall, t=np.tile(recording.t, times))
+        tracemalloc.start()
+        count = sum(1 for _ in mcap.messages(repeated, geometry))
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert count > 4 * len(records)
+        return most
+
+    peak(1)  # what is loaded and compiled once
+    assert peak(30) - peak(10) < 500 * 20 * len(recording.records)
+
+
+@settings(max_examples=20)
+@given(st.lists(st.integers(-2 * 10**9, 2 * 10**9), max_size=3), st.integers(1, 200))
+def test_messages_are_in_order_of_time_though_the_clock_was_set(
+    recording: Recording, steps: list[int], rows: int
+) -> None:
+    """Each message still has the time of its own record or line."""
+    records, wall = recording.records[:200], recording.wall[:200].copy()
+    for number, step in enumerate(steps, 1):
+        wall[number * len(wall) // 4 :] += np.timedelta64(step, "ns")
+    changed = recording._replace(records=records, wall=wall, t=recording.t[:200])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mcap, "BLOCK_ROWS", rows)
+        made = list(mcap.messages(changed, config.geometry(load(SIM).geometry)))
+    times = [time for time, _, _ in made]
+    assert times == sorted(times)
+    poses = {(time, message.pose.position.x) for time, topic, message in made if topic == "/pose"}
+    assert poses == set(zip(wall.astype(np.int64).tolist(), records["pose"][:, 0].tolist(), strict=True))
+    assert sum(topic == "/events" for _, topic, _ in made) == len(recording.events)
