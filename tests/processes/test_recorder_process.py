@@ -7,7 +7,9 @@ import socket
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import made
 import msgspec
 import numpy as np
 import pytest
@@ -16,8 +18,10 @@ from trirail.config import Config
 from trirail.processes import recording
 from trirail.processes.heartbeats import Heartbeats
 from trirail.telemetry.reading import read
+from trirail.telemetry.recorder import Recorder
 from trirail.wire.links import PACKETS_PER_TURN, LinkClosed, PacketLink
-from trirail.wire.packets import Kind
+from trirail.wire.messages import Event
+from trirail.wire.packets import EventReport, Kind, message
 from trirail.wire.records import DTYPE
 
 
@@ -75,3 +79,35 @@ def test_the_recorder_saves_while_packets_keep_arriving(tmp_path: Path, monkeypa
     (file,) = tmp_path.glob("demo-*.rrd")
     assert read(file).records["cycle"].tolist() == [*range(1, 1001)]
     assert np.diff([0, *saved_at, 1000]).max() <= PACKETS_PER_TURN
+
+
+def test_a_black_box_has_the_times_of_the_moment_though_the_clock_was_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent, start = made.records(3.0), 1_795_245_300_000_000_000
+    clocks = {"monotonic": made.MONOTONIC_NS, "offset": start - made.MONOTONIC_NS}
+
+    def recorder(*given: Any, **more: Any) -> Recorder:
+        wall_ns, monotonic_ns = lambda: sum(clocks.values()), lambda: clocks["monotonic"]
+        return Recorder(*given, **more, wall_ns=wall_ns, monotonic_ns=monotonic_ns)
+
+    monkeypatch.setattr(recording, "Recorder", recorder)
+    ours, loops = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, loops:
+        intake = recording.Intake(config_in(tmp_path), None, PacketLink(ours), lambda _: None)
+        for first in range(0, len(sent), 100):
+            batch = sent[first : first + 100]
+            clocks["monotonic"] = int(batch["deadline_ns"][-1])
+            if first == 500:
+                clocks["offset"] += 3_600_000_000_000
+            intake.on_packet(bytes([Kind.RECORDS]) + batch.tobytes())
+            if first == 700:
+                wall = sum(clocks.values()) * 1e-9
+                fault = Event("fault", "error", "drive B: silent", seq=1, t=0.8, cycle=800, time=wall)
+                intake.on_packet(message(EventReport(fault)))
+        intake.close()
+    kept, box = (read(next(tmp_path.glob(f"{name}-*.rrd"))) for name in ("demo", "fault"))
+    expected = start + np.arange(3000) * 1_000_000 + np.where(np.arange(3000) >= 500, 3_600_000_000_000, 0)
+    for found in (kept, box):
+        assert np.array_equal(found.wall.astype(np.int64), expected[found.records["cycle"]])
+    assert set(range(1000)) <= set(box.records["cycle"].tolist())

@@ -6,6 +6,7 @@ import os
 import resource
 import shutil
 import socket
+import tempfile
 import threading
 from collections import namedtuple
 from pathlib import Path
@@ -16,11 +17,14 @@ import made
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ports import free_port
 from rerun.chunk import Chunk, RrdReader
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
+from trirail.telemetry import contents
 from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.readout import ReadoutState
@@ -28,6 +32,7 @@ from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, is_watched
 from trirail.telemetry.streams import Streams
 from trirail.wire.messages import Event
+from trirail.wire.packets import ControlInput, PlannerLost
 from trirail.wire.records import DTYPE
 from trirail_drivers.bus.can_frame import CAPTURED
 from trirail_drivers.bus.frames import Frame, packed
@@ -406,3 +411,44 @@ def test_frames_are_not_kept_unless_asked_for(tmp_path: Path) -> None:
     recording.frames(CAPTURED.pack(1.0, Frame(0x201).packed))
     recording.close()
     assert [path.suffix for path in tmp_path.iterdir()] == [".rrd"]
+
+
+# ---------------------------------------------------------------------- the wall clock
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.tuples(st.integers(-(10**13), 10**13), st.booleans()), max_size=8))
+def test_all_data_has_the_wall_clock_time_of_its_cycle_when_the_clock_is_set(steps: list[tuple[int, bool]]) -> None:
+    """The inputs and the drawings too; readings of the clocks that took long do not count."""
+    sent, offset, offsets = made.records(0.5), WALL_NS - made.MONOTONIC_NS, list[int]()
+    now, interrupted = made.MONOTONIC_NS, False
+
+    def monotonic() -> int:
+        nonlocal now
+        now += 20_000_000 if interrupted else 0
+        return now
+
+    with tempfile.TemporaryDirectory() as folder:
+        to = recorder(Path(folder), sidecars=True, wall_ns=lambda: now + offset, monotonic_ns=monotonic)
+        for number, start in enumerate(range(0, len(sent), 50)):
+            batch = sent[start : start + 50]
+            step, interrupted = steps[number] if number < len(steps) else (0, False)
+            now = int(batch["deadline_ns"][-1])
+            if not interrupted:
+                offset += step if abs(step) > 5_000_000 else 0
+            to.records(batch.tobytes())
+            item = ControlInput(number, start, int(batch["deadline_ns"][0]), PlannerLost("no planner"))
+            to.control_input(item)
+            offsets += [offset] * len(batch)
+        interrupted = False
+        to.close()
+        times = sent["deadline_ns"] + np.array(offsets)
+        found = [chunk for chunk in RrdReader(to.path).stream() if not chunk.is_static]
+        assert {"/record", "/requests", "/mode", "/robot/platform"} <= {chunk.entity_path for chunk in found}
+        for batch in (chunk.to_record_batch() for chunk in found):
+            cycles = batch.column("t").to_numpy().astype(np.int64) // 1_000_000
+            walls = batch.column("wall").to_numpy().astype(np.int64)
+            assert np.abs(walls - times[cycles]).max() < 1000  # the inputs' times are floats
+        entry = contents.load(to.path)
+    assert entry is not None
+    assert (entry.began, entry.ended) == pytest.approx((times[0] * 1e-9, times[-1] * 1e-9), abs=1e-5)

@@ -149,7 +149,7 @@ def _print(listed: list[RecordedSession], of: int) -> None:
 
 
 def _lasted(session: RecordedSession) -> str:
-    if session.began is None or session.ended is None:
+    if session.began is None or session.ended is None or session.ended < session.began:  # the clock was set back
         return ""
     minutes, seconds = divmod(round(session.ended - session.began), 60)
     hours, minutes = divmod(minutes, 60)

@@ -73,6 +73,8 @@ class Intake:
             return Recorder(config, folder, name=name, reason=reason, sidecars=sidecars, live=False)
 
         self._box = BlackBox(config.loop.rate_hz, box, self._warn)
+        self._wall_offset_ns: int | None = None
+        """Wall clock minus monotonic clock of the black box's newest data [ns]; None before the first records."""
 
     def on_packet(self, packet: bytes) -> None:
         """Process a packet from the loop."""
@@ -81,6 +83,7 @@ class Intake:
         if packet[0] == Kind.RECORDS:
             self._cycle = last_cycle(content)
             self.recorder.records(content)
+            self._latch_wall_offset()
             self._box.records(content)
         elif packet[0] == Kind.FRAMES:
             self.recorder.frames(content)
@@ -103,6 +106,12 @@ class Intake:
         """Complete and close all files."""
         self.recorder.close()
         self._box.close()
+
+    def _latch_wall_offset(self) -> None:
+        """Store when the wall clock was set, so that the records of a black box have the time of their own moment."""
+        if self._wall_offset_ns != self.recorder.wall_offset_ns:
+            self._wall_offset_ns = self.recorder.wall_offset_ns
+            self._box.latch("set_wall_offset", self._wall_offset_ns)
 
     def _handle_answer(self, answer: Answer) -> None:
         recorder, box = self.recorder, self._box

@@ -41,6 +41,13 @@ CHECKS_HZ = 1
 TIDY_EVERY = 10.0
 """Interval at which the folder is checked, and at which the sidecar of the newest file is written [s]."""
 MB = 1e6
+CLOCK_STEP_NS = 5_000_000
+"""Minimum change of the wall clock against the monotonic clock that counts as a step [ns].
+
+Both clocks follow the corrections of the network time in the same way, so only a clock that is set makes a step.
+"""
+CLOCK_READING_NS = 1_000_000
+"""Maximum duration of a reading of both clocks [ns]. A reading that was interrupted for longer is not used."""
 
 
 class Recorder:
@@ -91,6 +98,7 @@ class Recorder:
     ) -> None:
         started_ns = wall_ns()
         self._wall_offset_ns = started_ns - monotonic_ns()
+        self._wall_ns, self._monotonic_ns = wall_ns, monotonic_ns
         self._config = config
         self._is_black_box = name is not None
         self._own_folder = directory if path is None and name is None else None
@@ -173,8 +181,22 @@ class Recorder:
         """Three counts: batches missing in the file, batches missing in the live view, and cycles not received."""
         return self.lost, self.skipped, self._missed_cycles
 
+    @property
+    def wall_offset_ns(self) -> int:
+        """Wall clock minus monotonic clock, from which the times of records and inputs are computed [ns]."""
+        return self._wall_offset_ns
+
+    def set_wall_offset(self, offset_ns: int) -> None:
+        """Set the wall clock minus the monotonic clock for all later data [ns]; earlier data keeps its times."""
+        if offset_ns != self._wall_offset_ns:
+            self._flush()
+            self._wall_offset_ns = offset_ns
+            self._streams.set_wall_offset(offset_ns)
+
     def records(self, batch: bytes) -> None:
         """Write packed records, and run the periodic checks when they are due."""
+        if not self._is_black_box:  # the data of a black box is older than the present time
+            self._follow_wall_clock()
         last = last_cycle(batch)
         if self._last is not None:
             self._missed_cycles += last - self._last - len(batch) // SIZE
@@ -273,6 +295,13 @@ class Recorder:
     def _flush(self) -> None:
         self._records.flush()
         self._streams.flush()
+
+    def _follow_wall_clock(self) -> None:
+        """Use the time of the wall clock from now on if the clock was set, as the events of the service do."""
+        before, wall, after = self._monotonic_ns(), self._wall_ns(), self._monotonic_ns()
+        offset = wall - (before + after) // 2
+        if after - before <= CLOCK_READING_NS and abs(offset - self._wall_offset_ns) > CLOCK_STEP_NS:
+            self.set_wall_offset(offset)
 
     def _run_checks(self) -> None:
         """Rotate the file, delete old recordings, write the sidecar and report missing data, if any of these is due."""

@@ -175,6 +175,10 @@ class Scene:
         self.bounds = self._parts.bounds
         """Bounds of the robot, (2, 2): lowest and highest x and y [m]."""
 
+    def set_wall_offset(self, offset_ns: int) -> None:
+        """Set the wall clock minus the monotonic clock for all later drawings [ns]."""
+        self._timelines = columns.Timelines(self._rate_hz, offset_ns)
+
     def still(self) -> Iterator[tuple[str, rr.AsComponents]]:
         """Yield the entity path and archetype of each static part."""
         yield from still(self._parts, self._frames, self._geometry.labels)

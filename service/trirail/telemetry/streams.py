@@ -102,6 +102,11 @@ class Streams:
             batches.add(batch)
         self._newest = batch[-DTYPE.itemsize :]
 
+    def set_wall_offset(self, offset_ns: int) -> None:
+        """Set the wall clock minus the monotonic clock for all later data [ns]. Call flush before."""
+        self._wall_offset_ns = offset_ns
+        self.scene.set_wall_offset(offset_ns)
+
     def update_state(self, state: ReadoutState) -> None:
         """Set the state that the readout shows from the next record on."""
         self._goal_drawn = self._goal_drawn and state.target == self._state.target
