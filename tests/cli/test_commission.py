@@ -16,7 +16,7 @@ from trirail.cli.app import app
 from trirail.commissioning.person import Question, QuitRequest
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
-from trirail_drivers.errors import FileError
+from trirail_drivers.errors import BusError, FileError
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
 PUSH = ["", "0.01", "0", "10", "0"]
@@ -127,9 +127,24 @@ def test_ctrl_c_ends_it_and_the_report_stays(
     monkeypatch.setattr(commission.Console, "ask", press)
     with pytest.raises(SystemExit, match="130"):
         run(robot, "--report", "r.json")
-    text = (tmp_path / "r.json").read_text()
-    assert [step["step"] for step in (json.loads(text)["steps"] if text else [])] == done
+    report = tmp_path / "r.json"
+    assert [step["step"] for step in (json.loads(report.read_text())["steps"] if report.exists() else [])] == done
+    assert bool(done) == report.exists() == report.with_suffix(".txt").exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_command_that_failed_before_its_first_step_can_be_run_again(robot: str, tmp_path: Path) -> None:
+    for failure in (("--fault", "A reverse"), ("--fault", "A loose, rubbish")):
+        for _ in range(2):
+            with pytest.raises(FaultSyntaxError):
+                run(robot, "--yes", *failure, "--report", "r.json")
+    bus = tmp_path / "bus.toml"
+    text = SIM.read_text(encoding="utf-8")
+    bus.write_text(text.replace('interface = "simulated"', 'interface = "socketcan"\nchannel = "none0"'))
+    for _ in range(2):
+        with pytest.raises(BusError):
+            run(str(bus), "--report", "r.json")
+    assert not list(tmp_path.glob("r.*"))
 
 
 def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path: Path) -> None:

@@ -84,14 +84,18 @@ def commission(
     made = reports.CommissioningReport(settings.robot.name, str(config), reports.now(), simulated, str(software()))
     keeper = reports.ReportFile(made, report or Path(name))
     person = Console(by_itself=yes, quiet=json)
-    with interruption() as interrupted, open_steps(settings, fault, person, interrupted) as steps:
-        guide = Guide(settings, config, steps, person, keeper)
-        try:
-            with contextlib.suppress(QuitRequest):
-                guide.run()
-            guide.write(out)
-        finally:
-            person.show(f"Report: {keeper.path} (for people: {keeper.text_path.name})")
+    try:
+        with interruption() as interrupted, open_steps(settings, fault, person, interrupted) as steps:
+            guide = Guide(settings, config, steps, person, keeper)
+            try:
+                with contextlib.suppress(QuitRequest):
+                    guide.run()
+                guide.write(out)
+            finally:
+                if keeper.is_saved:
+                    person.show(f"Report: {keeper.path} (for people: {keeper.text_path.name})")
+    finally:
+        keeper.remove_if_empty()
     if json:
         terminal.json(reports.content(made))
     return 0 if made.ok else 1

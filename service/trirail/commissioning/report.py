@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from pathlib import Path
 
@@ -81,6 +82,7 @@ class ReportFile:
         """Create the JSON file at `path`. Raises FileError if one of the files exists or cannot be created."""
         self.report = report
         self.path = path
+        self._is_saved = False
         if path == self.text_path:
             raise FileError(f"{path} is the name of the text version; choose another one with --report, as report.json")
         for file in (path, self.text_path):
@@ -95,6 +97,17 @@ class ReportFile:
     def text_path(self) -> Path:
         """Path of the text file."""
         return self.path.with_suffix(".txt")
+
+    @property
+    def is_saved(self) -> bool:
+        """True if the report has been saved at least once."""
+        return self._is_saved
+
+    def remove_if_empty(self) -> None:
+        """Remove the JSON file if no report has been saved, so that the same command can be run again."""
+        if not self._is_saved:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
 
     def add(self, step: str, drive: str, judgement: Judgement, measured: dict[str, Number]) -> None:
         """Add an entry for a step, and save the report."""
@@ -112,6 +125,7 @@ class ReportFile:
     def save(self) -> None:
         """Write both files; each file is replaced atomically."""
         _replace(self.path, msgspec.json.format(msgspec.json.encode(content(self.report)), indent=2).decode() + "\n")
+        self._is_saved = True
         _replace(self.text_path, "\n".join(format_lines(self.report)) + "\n")
 
 
