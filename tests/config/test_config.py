@@ -97,6 +97,26 @@ def test_shipped_configurations_load(path: Path) -> None:
             "[telemetry]\nmetrics_port = 7447",
             "telemetry.metrics_port: port 7447 is also that of zenoh.listen[0]",
         ),
+        (
+            "live_port = 9876",
+            "live_port = 8447",
+            "telemetry.live_port: port 8447 is also the stop port of zenoh.",
+        ),
+        (
+            "[telemetry]",
+            "[telemetry]\nmetrics_port = 8447",
+            "telemetry.metrics_port: port 8447 is also the stop port of zenoh.listen[0]; use different ports",
+        ),
+        (
+            LISTEN,
+            'listen = ["tcp/127.0.0.1:8447", "tcp/[::1]:7447", "tcp/127.0.0.1:7447"]',
+            "zenoh.listen[0]: port 8447 is also the stop port of zenoh.listen[2]; use different ports",
+        ),
+        (
+            LISTEN,
+            'listen = ["tcp/127.0.0.1:62600", "tcp/127.0.0.1:64600"]',
+            "zenoh.listen[1]: stop port 63600 is also the stop port of zenoh.listen[0]; use different ports",
+        ),
         ("[loop]", "[poses]\n5mm = [0.0, 0.0, 0.0]\n[loop]", "poses.5mm: 5mm reads as a number or a quantity"),
         (LISTEN, f"{LISTEN}\n[zenoh.tls]", "with [zenoh.tls] every endpoint must be tls/ADDRESS:PORT"),
         (LISTEN, f"{TLS.replace(':7447', ':7447#enable_mtls=false')}", "settings after # would bypass [zenoh.tls]"),

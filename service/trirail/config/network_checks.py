@@ -6,12 +6,14 @@ import ipaddress
 import itertools
 from collections.abc import Iterator
 from functools import partial
+from typing import NamedTuple
 
 from trirail_drivers.driver.requirements import Rule
 
 from trirail.config.tables import Config, Zenoh
 from trirail.errors import ConfigError
 from trirail.wire.endpoints import ReachableBy, fault_of, reach, same_port, tcp_address
+from trirail.wire.stop_protocol import stop_address
 
 
 def network_rules(config: Config) -> Iterator[Rule]:
@@ -19,23 +21,52 @@ def network_rules(config: Config) -> Iterator[Rule]:
     yield from reach_rules(config.zenoh)
     reads = "telemetry.metrics_port", "zenoh"
     yield Rule("telemetry.metrics_address", reads, partial(_check_metrics, config))
+    for first, second in itertools.combinations(_listeners(config), 2):
+        if not (first.is_stop_port and second.is_stop_port and first.endpoint_port == second.endpoint_port):
+            yield Rule(second.key, (first.key, "telemetry.metrics_address"), partial(_check_port, first, second))
+
+
+class _Listener(NamedTuple):
+    """Address at which the service listens."""
+
+    key: str
+    """Key of the configuration that determines the address."""
+    address: tuple[str, int]
+    endpoint_port: int = 0
+    """Port of the endpoint to which a stop port belongs; 0 if the address is not that of a stop port."""
+
+    @property
+    def is_stop_port(self) -> bool:
+        return self.endpoint_port != 0
+
+    @property
+    def port_name(self) -> str:
+        """Name of the port for messages."""
+        return f"the stop port of {self.key}" if self.is_stop_port else f"that of {self.key}"
+
+
+def _listeners(config: Config) -> Iterator[_Listener]:
+    """Yield the TCP addresses at which the service listens, with the stop ports first."""
+    endpoints = [(f"zenoh.listen[{index}]", at) for index, at in enumerate(config.zenoh.listen)]
+    for key, endpoint in endpoints:
+        stop, address = stop_address(endpoint), tcp_address(endpoint)
+        if stop is not None and address is not None and not isinstance(stop.where, str):
+            yield _Listener(key, stop.where, address[1])
+    for key, endpoint in endpoints:
+        if (address := tcp_address(endpoint)) is not None:
+            yield _Listener(key, address)
     telemetry = config.telemetry
-    addresses = [
-        (f"zenoh.listen[{index}]", tcp_address(at)) for index, at in enumerate(config.zenoh.listen) if not fault_of(at)
-    ]
-    addresses += [
-        ("telemetry.live_port", ("127.0.0.1", telemetry.live_port)),
-        ("telemetry.metrics_port", (telemetry.metrics_address, telemetry.metrics_port)),
-    ]
-    listening = [(key, address) for key, address in addresses if address is not None and address[1]]
-    for (key, address), (other, second) in itertools.combinations(listening, 2):
-        yield Rule(other, (key, "telemetry.metrics_address"), partial(_check_port, key, address, other, second))
+    if telemetry.live_port:
+        yield _Listener("telemetry.live_port", ("127.0.0.1", telemetry.live_port))
+    if telemetry.metrics_port:
+        yield _Listener("telemetry.metrics_port", (telemetry.metrics_address, telemetry.metrics_port))
 
 
-def _check_port(key: str, address: tuple[str, int], other: str, second: tuple[str, int]) -> None:
+def _check_port(first: _Listener, second: _Listener) -> None:
     """Refuse a port that two listeners would share."""
-    if same_port(address, second):
-        raise ConfigError(f"{other}: port {second[1]} is also that of {key}; use different ports")
+    if same_port(first.address, second.address):
+        port = f"{'stop port' if second.is_stop_port else 'port'} {second.address[1]}"
+        raise ConfigError(f"{second.key}: {port} is also {first.port_name}; use different ports")
 
 
 def _check_metrics(config: Config) -> None:
