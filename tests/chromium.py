@@ -67,16 +67,16 @@ class Page:
         """One more page of the same browser."""
         return Page(self._pipe)
 
-    def open(self, url: str) -> None:
+    def open(self, url: str, arrives_at: str = "") -> None:
         # In a window of its own: pages behind others draw nothing.
         self._target = self._pipe.call("Target.createTarget", url="about:blank", newWindow=True)["targetId"]
         self._session = self._pipe.call("Target.attachToTarget", targetId=self._target, flatten=True)["sessionId"]
-        self.navigate(url)
+        self.navigate(url, arrives_at)
 
-    def navigate(self, url: str) -> None:
-        """Show another address in the same tab."""
+    def navigate(self, url: str, arrives_at: str = "") -> None:
+        """Show another address in the same tab, which may lead to a further one."""
         self._call("Page.navigate", url=url)
-        self.until(f"location.href.startsWith({url!r}) && document.readyState === 'complete'")
+        self.until(f"location.href.startsWith({arrives_at or url!r}) && document.readyState === 'complete'")
 
     def picture(self) -> Image.Image:
         shot = self._call("Page.captureScreenshot", format="png")["data"]

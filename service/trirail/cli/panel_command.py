@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import html
 import os
 import re
 import secrets
 import signal
 import stat
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from trirail_drivers import files
 
 from trirail.cli import terminal
 from trirail.cli.options import HERE, Service
@@ -56,7 +60,8 @@ def panel(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     secret = read_token(token) if token is not None else None
     wait_for_robot(service)
-    with Panel(AsyncRobot(service.robot, service.connect, tls=service.tls), port, secret) as served:
+    served_robot = AsyncRobot(service.robot, service.connect, tls=service.tls)
+    with Panel(served_robot, port, secret) as served, contextlib.ExitStack() as opened:
         show(
             service,
             {"url": served.url},
@@ -65,10 +70,27 @@ def panel(
         if open_:
             import webbrowser
 
-            webbrowser.open(served.url)
+            try:
+                webbrowser.open(opened.enter_context(redirect_to(served.url)))
+            except OSError as error:
+                terminal.print_error(f"cannot open the browser: {error}; open the printed address in it")
         with Signals() as ends:
             ends.first()
     return 0
+
+
+@contextlib.contextmanager
+def redirect_to(url: str) -> Iterator[str]:
+    """Create a file that leads a browser to `url`, and yield the address of the file; remove the file at the end.
+
+    Only this user can read the file, but every user of this machine can see the arguments of a browser's process, and
+    whoever knows the token in `url` can move the robot. Raises OSError.
+    """
+    with files.temporary_folder() as folder:
+        file = folder / "panel.html"
+        with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as made:
+            made.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={html.escape(url)}">\n')
+        yield file.as_uri()
 
 
 def wait_for_robot(service: Service) -> None:
