@@ -83,8 +83,8 @@ def panel(
 def redirect_to(url: str) -> Iterator[str]:
     """Create a file that leads a browser to `url`, and yield the address of the file; remove the file at the end.
 
-    Only this user can read the file, but every user of this machine can see the arguments of a browser's process, and
-    whoever knows the token in `url` can move the robot. Raises OSError.
+    Only this user can read the file, but every user of this machine can see the arguments of a browser's process. The
+    token in `url` is enough to move the robot. Raises OSError.
     """
     with files.temporary_folder() as folder:
         file = folder / "panel.html"

@@ -74,8 +74,8 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
         The folder cannot be listed.
     """
     listed = []
-    found = [path for path in folder.iterdir() if path.suffix == ".rrd"]  # glob would skip a folder that is unreadable
-    for path in sorted(found, key=lambda path: path.name):
+    recordings = [path for path in folder.iterdir() if path.suffix == ".rrd"]  # glob hides that a folder is unreadable
+    for path in sorted(recordings, key=lambda path: path.name):
         known = contents.load(path)
         if known is None or known.running or reread:
             try:
