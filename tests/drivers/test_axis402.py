@@ -122,6 +122,18 @@ def test_an_error_persists_while_the_error_register_shows_one(register: int) -> 
     assert axis.find_fault(T, WANTED) is None
 
 
+@pytest.mark.parametrize("homes", [True, False])
+@pytest.mark.parametrize(("code", "lost"), [(0x7300, True), (0x7305, True), (0x73FF, True), (0x7400, False)])
+def test_an_incremental_encoder_that_has_failed_must_be_homed_again(homes: bool, code: int, lost: bool) -> None:
+    axis = made()
+    axis.homes = axis.homed = True
+    axis.homes = homes
+    axis.on_emergency(canopen_frames.EMERGENCY.pack(code, 0x20, bytes(5)), T)
+    axis.on_emergency(OVER, T)
+    axis.clear_faults(T)
+    assert axis.homed == (not (homes and lost))
+
+
 def test_a_drive_that_has_left_its_fault_has_no_code_of_it() -> None:
     axis = made()
     axis.on_status(FAULT, T)

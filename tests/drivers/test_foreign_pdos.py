@@ -63,6 +63,17 @@ def test_a_statusword_in_a_fixed_tpdo_is_polled_unless_that_tpdo_repeats_it(
         assert (axis.exchange.status, axis.exchange.polled) == (0x380 + axis.node, polled)
 
 
+@pytest.mark.parametrize(("taken", "chosen", "coasts"), [((1, 2, 3), 3, False), ((1, 2), 1, False), ((2,), 2, True)])
+def test_a_drive_without_its_master_has_a_ramp_if_it_accepts_any(
+    closing: Closing, taken: tuple[int, ...], chosen: int, coasts: bool
+) -> None:
+    habits = Habits(values={(0x6007, 0): 0}, refuses={(0x6007, 0): lambda value: value not in taken})
+    rig = closing(Rig("elmo_gold", habits))
+    rig.ready()
+    assert [node.value(0x6007) for node in rig.nodes] == [chosen] * 3
+    assert any("the drive coasts" in warning for warning in rig.warnings) == coasts
+
+
 @pytest.mark.parametrize(("held", "wanted"), [(0, 0), (20, 20), (100, 100), (101, 100), (65535, 100)])
 def test_a_drive_reacts_soon_to_a_following_error(closing: Closing, held: int, wanted: int) -> None:
     rig = closing(Rig("elmo_gold", Habits(values={(0x6066, 0): held})))

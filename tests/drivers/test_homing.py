@@ -6,6 +6,8 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import cast
 
 import can
 import canopen
@@ -26,12 +28,14 @@ from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import Cia402Axis
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.faults import Faults
+from trirail_drivers.simulated.profile import MakersRules
 from waiting import WITHIN
 
 pytestmark = pytest.mark.long
@@ -431,6 +435,26 @@ def test_a_fault_stops_it_at_once_and_it_can_begin_again(rig: Rig, cause: str, w
     rig.until(lambda: not rig.control.measured.unready)  # and is configured again, where it was silent
     assert not any(drive.state is PowerState.OPERATION_ENABLED for drive in rig.drives)
     assert not any(drive.servo.velocity for drive in rig.drives)
+    assert isinstance(rig.command("reset"), CommandDone)
+    rig.enable()
+    settled(rig)
+    is_homed(rig)
+
+
+@pytest.mark.parametrize("when", WHEN)
+def test_drives_that_show_their_mode_only_with_power_return_from_a_homing_that_was_broken_off(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch, when: int
+) -> None:
+    """Without power, they still show the mode of homing."""
+    rig = robots(incremental())
+    monkeypatch.setattr(MakersRules, "shows_mode_with_power_alone", property(lambda _: True))
+    for axis in cast(Cia402, rig.driver)._axes:
+        axis.exchange = replace(axis.exchange, mode_shown=False)
+    rig.enable()
+    begin(rig, when)
+    rig.cycle(CommandRequest(7, "ann", Command.QUICK_STOP))
+    rig.until(lambda: rig.mode is Mode.FAULT, 4)
+    rig.cycles(400)
     assert isinstance(rig.command("reset"), CommandDone)
     rig.enable()
     settled(rig)

@@ -376,6 +376,19 @@ def test_another_home_offset_makes_the_robot_not_homed(rig: RecoveryRig) -> None
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
     assert rig.said("drive A: object 607C:00 (home offset) is 500, was 0")
+    # It is not forgotten when the supply is lost once more, and over when the offset is what it was.
+    for offset, code in ((500, RefusalCode.NOT_HOMED), (0, None)):
+        rig.order("disable")
+        rig.cycles(50)
+        rig.cut(0)
+        rig.cycles(300)
+        rig.supply(0)
+        rig.drives[0].objects[0x607C, 0].value = offset
+        rig.until(rig.ready, ENDS)
+        assert isinstance(rig.command("reset"), CommandDone)
+        rig.enable()
+        answer = rig.goal(f"g{offset}", 0.01, 0.0, 0.0)
+        assert getattr(answer, "code", None) is code
 
 
 class AbsentRig(RecoveryRig):

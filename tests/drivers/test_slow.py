@@ -233,9 +233,13 @@ def held(rig: SlowRig) -> list[float]:
     return [node.servo.position for node in rig.nodes]
 
 
+@pytest.mark.parametrize("shown", [0, 6])
 @pytest.mark.parametrize("name", ["elmo_gold", "pilz_prbt", "maxon_epos4_compact50_5"])
-def test_a_mode_that_is_shown_only_with_power_is_waited_for_where_the_drive_stands(closing: Closing, name: str) -> None:
-    rig = closing(SlowRig(name, lambda _: Slowness(shows=0, mode_takes=0.3)))
+def test_a_mode_that_is_shown_only_with_power_is_waited_for_where_the_drive_stands(
+    closing: Closing, name: str, shown: int
+) -> None:
+    """Without power, it shows none, or that of a homing that was broken off."""
+    rig = closing(SlowRig(name, lambda _: Slowness(shows=shown, mode_takes=0.0 if shown else 0.3)))
     rig.ready()
     assert any("until it shows mode" in warning for warning in rig.warnings)
     began = held(rig)

@@ -332,7 +332,7 @@ def test_german_has_decimal_commas_and_words_for_what_the_service_says(page: Pag
     page.until("document.querySelector('#going').dataset.may === 'yes'")
     typed(page, "500", "0", "0")
     page.until("document.querySelector('#going').dataset.may === 'no'")
-    assert page.text("#going-says").startswith("Schlitten ")
+    assert page.text("#going-says").startswith("Plattform x: ")
     robot.refusal = RefusedError(RefusalCode.NOT_AT_REST, "slider A is moved from outside", slider="A")
     page.click("[data-command=enable]")
     page.until(f"{ANSWER}.startsWith('Ein: ein Schlitten wird von außen bewegt')")

@@ -30,6 +30,8 @@ ANSWER_TIME = 0.5
 STANDSTILL_DISTANCE_M = 2e-5
 """Distance [m] within which a slider must stay for STANDSTILL_TIME_S to count as at rest."""
 STANDSTILL_TIME_S = 0.1
+SENSOR_ERRORS = 0x7300
+"""Error codes 73xxh of CiA 402-2, which concern the encoder."""
 RESET_TIME = 2 * canopen_frames.STATUS_PERIOD
 """Longest time until a drive leaves the fault state after a fault reset [s]: two periods of its statusword."""
 
@@ -57,6 +59,8 @@ class Cia402Axis(Axis):
         self.still = max(1.0, abs(scale.counts_per_metre) * STANDSTILL_DISTANCE_M)
         self.status_heard = self.stands_since = math.inf
         self.status_within = STATUS_WITHIN
+        self.homes = False
+        """Whether the drive has a homing method, since its encoder is incremental."""
         self.has_setpoint = False
         """Whether the drive has been sent a setpoint."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
@@ -335,6 +339,8 @@ class Cia402Axis(Axis):
             self.error_code = self.error_code if register else 0
             return
         self.error_code = code
+        if code & 0xFF00 == SENSOR_ERRORS and self.homes:
+            self.homed = False  # an incremental encoder may have lost counts
         self.note_fault("emcy", code, f"emergency {describe_error(code, f', error register 0x{register:02X}')}")
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:

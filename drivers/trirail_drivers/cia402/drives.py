@@ -62,7 +62,8 @@ class Cia402(Driver[Cia402Axis]):
         """`reopening` reopens a lost bus; `io` contains the digital outputs and inputs of each drive."""
         super().__init__(bus, timing, drives, clock, Cia402Axis, reopening=reopening, io=io)
         self._other_masters = OtherMasters(self._wire, self._axes, drives.master_node)
-        for axis in self._axes:
+        for axis, drive in zip(self._axes, drives.each, strict=True):
+            axis.homes = drive.homing is not None
             self._listen(axis)
         self._homing = HomingSequence(self._axes, drives, self._wire.send)
         self._sync = Frame(canopen_frames.SYNC)
@@ -314,6 +315,7 @@ class Cia402(Driver[Cia402Axis]):
             else:
                 word = canopen_frames.OUTPUTS.pack(wanted | axis.outputs_kept)
                 sent = self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + word)
+                axis.poll_due = now + canopen_frames.POLL_PERIOD  # another request could overwrite this one
             if sent:
                 axis.outputs_sent = wanted
 
@@ -321,10 +323,15 @@ class Cia402(Driver[Cia402Axis]):
         """Write the safe values of the outputs and wait for the answers. SDOs also work in NMT pre-operational."""
         self.set_outputs([axis.io.safe for axis in self._axes])
         asked = [axis for axis in self._axes if axis.has_outputs and axis.configured]
+        self._await_answers(asked)  # a server handles one request at a time (CiA 301)
         for axis in asked:
             word = canopen_frames.OUTPUTS.pack(axis.outputs | axis.outputs_kept)
             axis.unanswered = 0
             self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + word)
+        self._await_answers(asked)
+
+    def _await_answers(self, asked: Sequence[Cia402Axis]) -> None:
+        """Wait until the drives have answered all SDO requests, at most for `sdo_timeout`."""
         deadline = self._clock() + self._drives.sdo_timeout
         while any(axis.unanswered for axis in asked) and (left := deadline - self._clock()) > 0:
             self._wire.wait(left, self._clock)

@@ -188,7 +188,7 @@ class HomingSequence:
         yield from self._sdo(axis, _WRITE_BYTE, _MODE, mode)
         deadline = self._now + self._sdo_timeout
         while (shown := (yield from self._sdo(axis, _READ, _MODE_DISPLAY))[4]) != mode:
-            if shown == 0 and not axis.mode.shown and axis.state is not PowerState.OPERATION_ENABLED:
+            if not axis.mode.shown and axis.state is not PowerState.OPERATION_ENABLED:
                 return  # the drive shows its mode only with power
             if self._now >= deadline:
                 raise HomingFailedError(f"object 6061:00 (Modes of operation display): expected {mode}, found {shown}")

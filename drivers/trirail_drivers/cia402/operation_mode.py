@@ -57,8 +57,8 @@ async def configure_mode(drive: Differences, modes: tuple[int, ...]) -> tuple[in
             continue
         if shown == mode:
             return mode, True
-        if shown == _NONE:
-            untold = untold or mode
+        if shown == _NONE or (shown == HOMING and await drive.remote.read(*MODE) == mode):
+            untold = untold or mode  # a drive that shows its mode only with power may show that of its last homing
         else:
             called = drive.remote.name_of(MODE_DISPLAY)
             refusal = refusal or ConfigurationRefused(drive.remote.name, called, *MODE_DISPLAY, mode, shown, waited)
@@ -68,7 +68,7 @@ async def configure_mode(drive: Differences, modes: tuple[int, ...]) -> tuple[in
     if len(modes) > 1:
         await _write(drive, chosen)
     drive.add_note(
-        f"{title(MODE_DISPLAY)} is 0: until it shows mode {chosen}, with power, the drive holds its position"
+        f"{title(MODE_DISPLAY)} is {shown}: until it shows mode {chosen}, with power, the drive holds its position"
     )
     return chosen, False
 

@@ -55,6 +55,11 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         remote.logs = False
         return configure_one(self.one._replace(remote=remote), self._fastest, self._check), client
 
+    def record_setup(self, made: SetUp, answered: int) -> None:
+        """Record a complete set-up. The home offset stays that of the first one, with which positions are compared."""
+        first = self.setup.home_offset if self.setup is not None else made.home_offset
+        super().record_setup(made._replace(home_offset=first), answered)
+
     def accept(self, made: SetUp, begun: Start) -> str:
         """Let the drive take part in the cycle. If its home offset has changed, the drive counts as not homed, and a
         warning is returned.

@@ -122,6 +122,8 @@ def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
     return f"; it holds {1000 * period:g} ms: set loop.rate_hz = {1 / period:g}"
 
 
+DISABLE_VOLTAGE_OPTION: Final = 2
+"""Value of 6007h with which a drive that has lost its master removes power without a ramp."""
 MAX_FOLLOWING_TIMEOUT_MS: Final = 100
 """Maximum time for which a following error may exceed its window before the drive reacts [ms]."""
 
@@ -129,8 +131,10 @@ MAX_FOLLOWING_TIMEOUT_MS: Final = 100
 async def configure_reactions(drive: Differences, drives: Drives, units: Units) -> None:
     """Configure the drive's reactions to faults: 6007h, 605Ah, 605Eh, 6065h, 6066h, 6085h."""
     name = drive.remote.name
-    # 6007h = 3: a drive without its master makes a quick stop. Removing power (2) or a fault (1) is also accepted.
-    await drive.ensure(0x6007, 0, 3, also=(2, 1))
+    # 6007h = 3: a drive without its master makes a quick stop. A fault (1), which has the ramp of 605Eh, is also
+    # accepted, and finally the removal of power (2).
+    if await drive.ensure(0x6007, 0, 3, also=(1, 2)) == DISABLE_VOLTAGE_OPTION:
+        drive.add_note(f"{title((0x6007, 0))} accepts neither 3 nor 1: without this service, the drive coasts")
     await drive.ensure(0x605A, 0, 2)  # quick stop: follow the ramp 6085h, then remove power
     # 605Eh = 2: after a fault, the drive follows the quick-stop ramp. Another ramp (1) or coasting (0) is accepted.
     await drive.ensure(0x605E, 0, 2, also=(1, 0))

@@ -148,7 +148,7 @@ class Requests:
         Raises RefusedError if too many commands are in progress, or if the command takes over the lease and the role of
         the user does not allow that.
         """
-        renews = name is Command.ACQUIRE and user not in self._acquires.values()
+        renews = isinstance(content, AcquireLease) and user not in self._acquires.values()
         if not (name.stops or renews):  # other commands must not end a lease
             self._check_command_count(user)
         if isinstance(content, AcquireLease) and content.force:
@@ -157,7 +157,7 @@ class Requests:
         request = CommandRequest(self._tickets, user, name, content)
         with self._urgent_section() if name.stops else nullcontext():
             self._send(incoming, request, REPLY_TIMEOUT_S + self._takes.get(name, 0.0))
-        if name is Command.ACQUIRE:
+        if isinstance(content, AcquireLease):
             self._acquires[request.ticket] = user
         return request.ticket
 
