@@ -9,6 +9,7 @@ import string
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace as replacement_refusal
 from rigs import Bus, Clock, alike, frame, ideal_servo
-from trirail_drivers.cia402 import backup, parameter_file
+from trirail_drivers.cia402 import backup, inspection, other_masters, parameter_file
 from trirail_drivers.cia402.backup import RestoreResult
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.objects import USES, Key
@@ -532,6 +533,23 @@ def test_no_other_master_may_be_on_the_bus(
     with pytest.raises(DriveError, match=rf"another master is on the bus and .*\(identifier {identifier:03X}\)"):
         rig.save() if doing == "save" else rig.restore(saved)
     assert len(rig.wires.sent) == sent
+    rig.wires.shutdown()
+
+
+@pytest.mark.parametrize(("identifier", "data", "remote"), [each for each in MASTERS if each[0] != 0x80])
+@pytest.mark.parametrize("doing", ["apply", "check"])
+def test_no_drive_is_set_up_beside_another_master(
+    doing: str, identifier: int, data: bytes, remote: bool, tmp_path: Path
+) -> None:
+    rig = Foreign(tmp_path)
+    rig.wires.__class__ = Overheard
+    assert isinstance(rig.wires, Overheard)
+    rig.wires.speaks = (rig.clock.now + 0.3, frame(identifier, data, is_remote_frame=remote))
+    apply = partial(inspection.inspect, rig.wires, rig.drives, 0.001, rig.clock, apply=True)
+    check = partial(other_masters.check_exclusive, rig.wires, rig.drives, rig.clock)
+    with pytest.raises(DriveError, match=rf"another master.*\(identifier {identifier:03X}\); stop the service"):
+        (apply if doing == "apply" else check)()
+    assert not rig.wires.sent
     rig.wires.shutdown()
 
 

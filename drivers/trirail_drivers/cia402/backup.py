@@ -13,7 +13,7 @@ from trirail_drivers.cia402 import canopen_frames, setup
 from trirail_drivers.cia402.makers_objects import address, owned
 from trirail_drivers.cia402.objects import Key
 from trirail_drivers.cia402.one_drive import HAS_POWER, wait_for_drive
-from trirail_drivers.cia402.other_masters import ExclusiveBus
+from trirail_drivers.cia402.other_masters import exclusive_bus
 from trirail_drivers.cia402.parameter_file import (
     IDENTITY,
     Origin,
@@ -30,8 +30,6 @@ from trirail_drivers.driver.conversations import read_until, run_concurrently
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock, PowerState
 
-LISTEN_TIME_S: Final = 0.5
-"""Shortest time spent listening for another master before the first frame is sent [s]; at least three heartbeats."""
 MAX_TIMEOUTS: Final = 3
 """Number of consecutive unanswered requests after which a drive counts as lost."""
 MAX_WRITE_ROUNDS: Final = 3
@@ -136,15 +134,10 @@ def _run_conversations(
 ) -> dict[str, T | DriveError]:
     """Run a conversation with each named drive. Raises DriveError if another master sends frames."""
     of = dict(zip(NAMES, drives.each, strict=True))
-    with ExclusiveBus(bus, [drive.node for drive in drives.each], drives.master_node) as watched:
+    with exclusive_bus(bus, drives, clock) as watched:
         remotes = [remote for remote in setup.remotes(watched, drives, clock) if remote.name in names]
-        listened = max(LISTEN_TIME_S, 3.0 * drives.heartbeat)
-
-        async def begun(remote: Remote) -> T:
-            await remote.client.pause(listened)
-            return await conversation(remote, of[remote.name])
-
-        ends = run_concurrently(watched, clock, [begun(remote) for remote in remotes], lambda: str(progress))
+        conversations = [conversation(remote, of[remote.name]) for remote in remotes]
+        ends = run_concurrently(watched, clock, conversations, lambda: str(progress))
     return {remote.name: end for remote, end in zip(remotes, ends, strict=True)}
 
 

@@ -9,6 +9,7 @@ import can
 
 from trirail_drivers.cia402 import canopen_frames, process_data, setup
 from trirail_drivers.cia402.one_drive import SetUp
+from trirail_drivers.cia402.other_masters import exclusive_bus
 from trirail_drivers.cia402.sdo import run_setups
 from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
@@ -37,12 +38,31 @@ def inspect(
 
     With `apply`, the required values are written to all three drives or, if one of them is refused, to none. The drives
     have no power then and do not store the values permanently. Without `apply`, nothing is written. "refused" contains
-    the reason if a drive does not answer or is refused. Raises DriveError if `apply` fails.
+    the reason if a drive does not answer or is refused. Raises DriveError if `apply` fails, or if another master is on
+    the bus, which could be moving the robot.
     """
+    if apply:
+        # A drive may send SYNC until its set-up: 1005h bit 30 is one of the values that are corrected.
+        with exclusive_bus(bus, drives, clock, allow_sync=True) as watched:
+            return _inspect(watched, drives, period, clock, fastest, apply=True, io=io, timing=timing)
+    return _inspect(bus, drives, period, clock, fastest, apply=False, io=io, timing=timing)
+
+
+def _inspect(
+    bus: can.BusABC,
+    drives: Drives,
+    period: float,
+    clock: Clock,
+    fastest: float | None,
+    *,
+    apply: bool,
+    io: Sequence[DigitalIo],
+    timing: BusTiming,
+) -> list[dict[str, Any]]:
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
     offset = process_data.plan_traffic(drives, io, 1.0 / period, timing).velocity_offset
     if apply:
-        results = inspect(bus, drives, period, clock, fastest, apply=False, io=io, timing=timing)
+        results = _inspect(bus, drives, period, clock, fastest, apply=False, io=io, timing=timing)
         refused = dict.fromkeys(each["refused"] for each in results if each["refused"])
         raise_combined([DriveError(text) for text in refused])
         tasks = setup.setup_tasks(bus, drives, scales, period, clock, io, velocity_offset=offset)

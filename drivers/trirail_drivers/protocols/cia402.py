@@ -11,6 +11,7 @@ from trirail_drivers.cia402.backup import restore, save
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.inspection import inputs, inspect
 from trirail_drivers.cia402.objects import PROTECTIONS, describe_protection
+from trirail_drivers.cia402.other_masters import check_exclusive
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import EDS, Frames, Mechanics, Servo, SimulatedDevice, SimulatedDrive
 
@@ -65,6 +66,7 @@ CIA402 = Protocol(
     simulated_drive=_simulated_drive,
     inspect=inspect,
     inputs=inputs,
+    check_exclusive=check_exclusive,
     save=save,
     restore=restore,
     protections={name: describe_protection(name) for name in PROTECTIONS},

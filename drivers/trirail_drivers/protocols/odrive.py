@@ -55,6 +55,7 @@ ODRIVE = Protocol(
     simulated_drive=_simulated_drive,
     inspect=None,
     inputs=None,
+    check_exclusive=None,
     save=None,
     restore=None,
     protections={name: describe_protection(name) for name in PROTECTIONS},
