@@ -18,7 +18,7 @@ class BesideService(SimulatedBus):
     def recv(self, timeout: float | None = None) -> object:  # type: ignore[override]
         return super().recv(timeout) if not timeout else frame(0x201, b"\x0f\x00")
 
-    def send(self, *_: object) -> None:  # type: ignore[override]
+    def send(self, *_: object) -> None:
         raise AssertionError("nothing may be sent")
 
 

@@ -44,7 +44,9 @@ TEXT, OCTET_STRING, DOMAIN = 0x09, 0x0A, 0x0F
 VOLATILE = {0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1F50, 0x1F51, 0x6040, 0x6042, 0x6060, 0x6071, 0x607A, 0x60B0,
             0x60B1, 0x60B2, 0x60B8, 0x60C1, 0x60FF}  # fmt: skip
 """What these dictionaries let be written that no drive keeps: targets, offsets, controlwords, commands."""
-OWNED = {int(name[:4], 16) for name in USES} | {0x60A9, 0x60AA}
+HOMING = {0x607C, 0x6098, 0x6099, 0x609A}
+"""Objects that set-up writes only where a drive has homing, which these have not."""
+OWNED = {int(name[:4], 16) for name in USES} - HOMING | {0x60A9, 0x60AA}
 
 
 def set_ups(key: Key) -> bool:

@@ -14,8 +14,9 @@ from rigs import Closing
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
 from trirail_drivers.cia402 import inspection
+from trirail_drivers.cia402.makers_objects import owned
 from trirail_drivers.cia402.objects import USES
-from trirail_drivers.config import ObjectWrite
+from trirail_drivers.config import Drive, Homing, ObjectWrite
 from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 KINDS = {"i8": 0x02, "i16": 0x03, "i32": 0x04, "u8": 0x05, "u16": 0x06, "u32": 0x07}
@@ -123,7 +124,8 @@ def configured(folder: Path, lines: str, example: str = "elmo_gold") -> Path:
 
 
 WHY = 'why = "…"'
-OWNED = sorted({name[:4] for name in USES} | {"1010", "1011", "100B", "1600", "1A03", "60A9", "60AA"})
+HOMING = {"607C", "6098", "6099", "609A"}
+OWNED = sorted({name[:4] for name in USES} - HOMING | {"1010", "1011", "100B", "1600", "1A03", "60A9", "60AA"})
 
 
 @pytest.mark.parametrize("index", OWNED)
@@ -156,3 +158,11 @@ def test_what_is_no_object_is_refused_with_the_key(tmp_path: Path, lines: str, e
 def test_what_may_be_written_is_read(tmp_path: Path) -> None:
     found = load(configured(tmp_path, f'object = 0x208E\nvalue = 0x100\ntype = "u16"\n{WHY}')).drives.B.write
     assert found == (ObjectWrite(0x208E, 256, "u16", "…"),)
+
+
+@pytest.mark.parametrize("index", sorted(HOMING))
+@pytest.mark.parametrize("homes", [False, True])
+def test_objects_of_homing_are_the_set_ups_only_with_homing(index: str, homes: bool) -> None:
+    homing = Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5) if homes else None
+    reason = owned((int(index, 16), 0), Drive(node=1, counts_per_metre=1e6, homing=homing))
+    assert reason.startswith("is written by the set-up") == homes

@@ -282,7 +282,7 @@ def _skip_reason(remote: Remote, drive: Drive, key: Key, saved: Parameter, of_fi
     if key[0] in _SDO_CHANNELS and of_file.node != of_drive.node:
         return "follows the node id"
     names = (saved.name, remote.name_of(key))
-    return owned(key) or next(filter(None, (address(key, name, of_drive.vendor) for name in names)), "")
+    return owned(key, drive) or next(filter(None, (address(key, name, of_drive.vendor) for name in names)), "")
 
 
 def _check(name: str, of_file: Origin, of_drive: Origin, *, replace: bool) -> None:

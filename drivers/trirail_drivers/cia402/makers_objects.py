@@ -15,6 +15,8 @@ from trirail_drivers.errors import DriveError
 _STORES: Final = "would store parameters in the drive, or restore stored ones"
 _ADDRESS: Final = "changes node id or bitrate, for which the manufacturer's tool is needed"
 _FORBIDDEN: Final = {0x1010: _STORES, 0x1011: _STORES, 0x100B: _ADDRESS}
+_HOMING: Final = (0x607C, 0x6098, 0x6099, 0x609A)
+"""Objects that the set-up writes only for a drive with homing."""
 _UNITS: Final = (0x60A9, 0x60AA)
 """Objects that are not in USES but that the set-up may write."""
 _ADDRESSES: Final = {
@@ -30,15 +32,17 @@ def check(name: str, drive: Drive, number: int) -> None:
     each = drive.write[number]
     key = each.object, each.sub
     twice = key in [(other.object, other.sub) for other in drive.write[:number]]
-    if why := owned(key) or ("is listed twice" if twice else ""):
+    if why := owned(key, drive) or ("is listed twice" if twice else ""):
         raise DriveError(f"drives.{name}.write: object {named(key)} {why}")
 
 
-def owned(key: Key) -> str:
+def owned(key: Key, drive: Drive) -> str:
     """Return the reason why the configuration may not write an object, or "" if it may.
 
-    It may not write the objects that the set-up writes, that store parameters, or that set the node id or bit rate.
+    It may not write the objects that the set-up of this drive writes, that store parameters, or that set the node id or bit rate.
     """
+    if key[0] in _HOMING and drive.homing is None:
+        return ""
     used = find_use(key)
     if used is not None or is_pdo(key[0]) or key[0] in _UNITS:
         return f"is written by the set-up{f', for {used[1].purpose}' if used else ''}"
