@@ -39,7 +39,8 @@ def check(name: str, drive: Drive, number: int) -> None:
 def owned(key: Key, drive: Drive) -> str:
     """Return the reason why the configuration may not write an object, or "" if it may.
 
-    It may not write the objects that the set-up of this drive writes, that store parameters, or that set the node id or bit rate.
+    It may not write the objects that the set-up of this drive writes, that store parameters, or that set the node id or
+    bit rate.
     """
     if key[0] in _HOMING and drive.homing is None:
         return ""
