@@ -134,7 +134,8 @@ def alter_and_restore(make: str, line: Line, chance: random.Random, path: Path) 
     assert set(saved.parameters) == set(kept(rows(make))) | mappings
     parameter_file.write(path, saved)
     assert parameter_file.read(path) == saved
-    altered = set(chance.sample(sorted(set(saved.parameters) - mappings), 12))
+    # The simulated drive refuses homing methods with index pulse, which some dictionaries have as their default.
+    altered = set(chance.sample(sorted(set(saved.parameters) - mappings - {(0x6098, 0)}), 12))
     for key in altered:
         other(line.objects[key], chance)
     assert {each.key for each in parameter_file.compare(saved, line.save())} == altered
