@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -210,7 +211,7 @@ def test_the_frames_of_one_drive(rig: Rig) -> None:
                 said.append(f"controlword {word:04X}")
     assert said == ["mode 6", "controlword 001F", "controlword 000F", "mode 8"]
     to_6, to_8, display, status = "2f60600006000000", "2f60600008000000", "4061600000000000", "4041600000000000"
-    assert asked == [to_6, display, status, to_8, display]
+    assert asked == [to_6, display, status, to_8, display, status]
 
 
 @pytest.mark.parametrize("word", [0x1F, 0x0F, 0x10F])
@@ -255,6 +256,57 @@ def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pyte
         moved = max(moved, abs(true_positions(rig)[0] - before))
     assert moved > 5e-5
     rig.until(lambda: rig.mode is Mode.HOLDING)
+
+
+@pytest.mark.parametrize("method", [35, 37])
+def test_homing_in_place_again_succeeds_with_drives_that_show_the_last_homing_until_the_next(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch, method: int
+) -> None:
+    rig = robots(incremental(method))
+    for drive in rig.drives:
+        monkeypatch.setattr(drive.homing, "forget", lambda: None)  # the start itself attains home: no statusword differs
+    rig.enable()
+    rig.command("home")
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert isinstance(rig.goal("g1", 0.02, 0.01, 0.1), Accepted)
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    rig.cycles(100)
+    assert rig.control.measured.feedback.position != pytest.approx(HOMES, abs=1e-3)
+    rig.command("home")
+    assert rig.control.measured.feedback.homed == (True, True, True)
+    assert rig.control.measured.feedback.position == pytest.approx(HOMES, abs=2e-7)
+    settled(rig)
+
+
+def test_a_statusword_of_homing_mode_does_not_show_that_the_drive_follows_setpoints(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bit 12 means "homing attained" in mode 6; afterwards this drive needs a while until it follows setpoints."""
+    mute = late = 0.0  # until when the drive sends no statusword by itself, and until when it follows no setpoints [s]
+    rig = robots(
+        incremental(),
+        lambda message: math.inf if message.arbitration_id == canopen_frames.TPDO1 + 1 and now() < mute else 0.0,
+    )
+    drive, following = rig.drives[0], SimulatedDrive._follows_command
+
+    def now() -> float:
+        return rig.now
+
+    def follows(self: SimulatedDrive) -> bool:
+        assert following.fget is not None
+        return bool(following.fget(self)) and (self is not drive or now() >= late)
+
+    monkeypatch.setattr(SimulatedDrive, "_follows_command", property(follows))
+    rig.enable()
+    begin(rig)
+    rig.until(lambda: modes(rig)[0] == 6)
+    rig.until(lambda: drive.homing.attained)
+    rig.cycles(2)
+    mute, late = now() + 0.02, now() + 1.5 * canopen_frames.STATUS_PERIOD
+    rig.until(lambda: rig.mode is not Mode.HOMING)
+    assert rig.control.fault is None
+    assert rig.control.measured.feedback.homed == (True, True, True)
+    settled(rig)
 
 
 def test_an_earlier_homing_error_is_not_taken_for_one_of_this_homing(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,6 +33,9 @@ One answer may still be waiting for the bus, and one may be assigned to the wron
 SETPOINT_SYNCS: Final = 2
 """Number of SYNCs after which a drive has applied a written setpoint."""
 
+HOME_IN_PLACE: Final = (35, 37)
+"""Homing methods with which the present position becomes home (CiA 402-2)."""
+
 _SDO: Final = Struct("<BHB4s")
 _WRITE_BYTE: Final = 0x2F
 _READ: Final = 0x40
@@ -57,7 +60,7 @@ class HomingSequence:
 
     def __init__(self, axes: tuple[Cia402Axis, ...], drives: config.Drives, send: Callable[[Frame], object]) -> None:
         self._plan = [
-            (axis, drive.homing.timeout)
+            (axis, drive.homing)
             for axis, drive in zip(axes, drives.each, strict=True)
             if drive.homing is not None
         ]
@@ -131,27 +134,36 @@ class HomingSequence:
             axis.homed = axis.homed and axis.left_out
 
     def _home_all(self) -> Steps:
-        for axis, timeout in self._plan:
+        for axis, homing in self._plan:
             if not self._stopping and not axis.left_out:
                 self._axis = axis
-                yield from self._home(axis, timeout)
+                yield from self._home(axis, homing)
 
     def _restore_all(self) -> Steps:
         for axis, _ in self._plan:
             self._axis = axis
             yield from self._follow_setpoints(axis)
 
-    def _home(self, axis: Cia402Axis, timeout: float) -> Steps:
+    def _home(self, axis: Cia402Axis, homing: config.Homing) -> Steps:
         axis.cyclic = False
         yield from self._change_mode(axis, HOMING)
         axis.follows = False
         # The newest statusword may have been sent in another mode, in which its bits have other meanings.
         yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.seen_clear = ~axis.statusword
+        started = axis.sampled + FRESH_ANSWERS
+
+        def home_attained() -> bool:
+            # Homing in place may end before any statusword shows it. At home, the drive counts from 0.
+            in_place = homing.method in HOME_IN_PLACE and axis.sampled >= started and abs(axis.actual) <= axis.still
+            return _attained(axis, seen=in_place)
+
         if not self._stopping:
             axis.mode_bits = canopen_frames.HOMING_START
-            yield from self._wait_until(lambda: self._stopping or _attained(axis), timeout, "home was not reached")
-        attained = _attained(axis)
+            yield from self._wait_until(
+                lambda: self._stopping or home_attained(), homing.timeout, "home was not reached"
+            )
+        attained = home_attained()
         if not attained:
             yield from self._halt(axis)
         axis.mode_bits = 0
@@ -181,6 +193,8 @@ class HomingSequence:
         taken_up = axis.syncs + SETPOINT_SYNCS
         yield from self._wait_until(lambda: axis.syncs >= taken_up, self._sdo_timeout, "no SYNC was sent")
         yield from self._change_mode(axis, axis.exchange.mode)
+        if axis.exchange.tells_following:  # bit 12 of the newest statusword may still have its meaning in homing mode
+            yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.cyclic = True
         axis.held = None
 
@@ -222,12 +236,13 @@ class HomingSequence:
             yield
 
 
-def _attained(axis: Cia402Axis) -> bool:
+def _attained(axis: Cia402Axis, *, seen: bool) -> bool:
     """Whether the drive has found home.
 
-    Bits 12 and 13 may still be set from an earlier homing, so they must have been clear since this homing began.
+    Bits 12 and 13 may still be set from an earlier homing, so they must have been clear since this homing began. Bit 12
+    need not have been clear if the result of this homing has been `seen` otherwise.
     """
     if axis.statusword & axis.seen_clear & _ERROR:
         raise HomingFailedError(f"the drive reports a homing error (statusword {axis.statusword:04X})")
     both = _HOMING_ATTAINED | _TARGET_REACHED
-    return axis.statusword & both == both and bool(axis.seen_clear & _HOMING_ATTAINED)
+    return axis.statusword & both == both and (seen or bool(axis.seen_clear & _HOMING_ATTAINED))
