@@ -264,7 +264,8 @@ def test_homing_in_place_again_succeeds_with_drives_that_show_the_last_homing_un
 ) -> None:
     rig = robots(incremental(method))
     for drive in rig.drives:
-        monkeypatch.setattr(drive.homing, "forget", lambda: None)  # the start itself attains home: no statusword differs
+        # The start itself attains home, so that no statusword shows bit 12 clear.
+        monkeypatch.setattr(drive.homing, "forget", lambda: None)
     rig.enable()
     rig.command("home")
     rig.until(lambda: rig.mode is Mode.HOLDING)
@@ -287,14 +288,13 @@ def test_a_statusword_of_homing_mode_does_not_show_that_the_drive_follows_setpoi
         incremental(),
         lambda message: math.inf if message.arbitration_id == canopen_frames.TPDO1 + 1 and now() < mute else 0.0,
     )
-    drive, following = rig.drives[0], SimulatedDrive._follows_command
+    drive, following = rig.drives[0], vars(SimulatedDrive)["_follows_command"].fget
 
     def now() -> float:
         return rig.now
 
     def follows(self: SimulatedDrive) -> bool:
-        assert following.fget is not None
-        return bool(following.fget(self)) and (self is not drive or now() >= late)
+        return bool(following(self)) and (self is not drive or now() >= late)
 
     monkeypatch.setattr(SimulatedDrive, "_follows_command", property(follows))
     rig.enable()

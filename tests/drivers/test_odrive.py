@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import can
 import msgspec
@@ -13,16 +13,18 @@ import numpy as np
 import pytest
 from control_rig import CONFIG as ROBOT
 from numpy.typing import NDArray
-from rigs import ENABLED, OFF, START, STEP, Bus, Clock, Closing, DriverRig, ideal_servo
+from rigs import ENABLED, OFF, START, STEP, Bus, Clock, Closing, DriverRig, frame, ideal_servo
 from trirail.config import Config
+from trirail_drivers.cia402 import other_masters
 from trirail_drivers.config import Drive, Drives
-from trirail_drivers.errors import DriveError, DriveTimeout
+from trirail_drivers.errors import BusError, DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.codes import describe_errors
 from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.odrive.flat_endpoints import Version
+from trirail_drivers.odrive.other_masters import check_exclusive
 from trirail_drivers.odrive.setpoints import SETTLE_TIME_S
 from trirail_drivers.simulated import SimulatedOdrive
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
@@ -94,6 +96,45 @@ def new() -> Iterator[Rig]:
     rig = Rig()
     yield rig
     rig.drives.close()
+
+
+COMMANDS_OF_MASTERS = [
+    cansimple.RX_SDO,
+    cansimple.SET_AXIS_STATE,
+    cansimple.SET_CONTROLLER_MODE,
+    cansimple.SET_INPUT_POS,
+    cansimple.CLEAR_ERRORS,
+]
+
+
+@pytest.mark.parametrize(
+    ("command", "remote"),
+    [(command, False) for command in COMMANDS_OF_MASTERS] + [(cansimple.GET_ENCODER_ESTIMATES, True)],
+)
+def test_another_master_is_noticed_before_drives_are_set_up(new: Rig, command: int, remote: bool) -> None:
+    for data in (bytes(8), bytes(4)):  # these frames are from before the check
+        new.bus.inject(cansimple.identifier(new.config.C.node, cansimple.SET_INPUT_POS), data)
+    message = frame(cansimple.identifier(new.config.C.node, command), is_remote_frame=remote)
+    receive = new.bus.recv
+    new.bus.recv = lambda timeout=None: message if timeout else receive(timeout)  # type: ignore[method-assign]
+    with pytest.raises(DriveError, match=rf"another master is on the bus.*\(identifier {message.arbitration_id:03X}\)"):
+        check_exclusive(new.bus, new.config, new.clock)
+    assert not new.bus.sent
+
+
+def test_drives_without_another_master_pass_the_check(new: Rig) -> None:
+    new.cycles(20)
+    check_exclusive(new.bus, new.config, new.clock)
+
+
+@pytest.mark.parametrize("check", [check_exclusive, other_masters.check_exclusive])
+def test_a_lost_bus_ends_the_check_with_a_bus_error(new: Rig, check: Callable[..., None]) -> None:
+    def fail(timeout: float | None = None) -> None:
+        raise can.CanOperationError("Network is down")
+
+    new.bus.recv = fail  # type: ignore[method-assign]
+    with pytest.raises(BusError, match="Network is down; check that the interface is up"):
+        check(new.bus, new.config, new.clock)
 
 
 IDLE = Rig.off
@@ -296,6 +337,14 @@ class TestFaults:
         )
         assert "motor calibration" in ready.found("state", within=1).message
         assert ready.drives.read().state[1] is P.SWITCHED_ON
+
+    @pytest.mark.parametrize("command", COMMANDS_OF_MASTERS)
+    def test_somebody_else_commands_a_drive(self, enabled: Rig, command: int) -> None:
+        enabled.move(20)
+        enabled.bus.inject(cansimple.identifier(enabled.config.B.node, command), bytes(8))
+        message = enabled.found("bus", within=1).message
+        assert message.startswith("CAN bus: another master is on the bus and ")
+        assert message.endswith(" (drive B); only one master is allowed")
 
     def test_following_error(self, enabled: Rig) -> None:
         stuck = enabled.devices[0].servo

@@ -60,9 +60,7 @@ class HomingSequence:
 
     def __init__(self, axes: tuple[Cia402Axis, ...], drives: config.Drives, send: Callable[[Frame], object]) -> None:
         self._plan = [
-            (axis, drive.homing)
-            for axis, drive in zip(axes, drives.each, strict=True)
-            if drive.homing is not None
+            (axis, drive.homing) for axis, drive in zip(axes, drives.each, strict=True) if drive.homing is not None
         ]
         self._sdo_timeout = drives.sdo_timeout
         self._stop_timeout = drives.stop_timeout

@@ -5,24 +5,19 @@ The service is the master. If it receives such a frame, there is another master 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Final
 
 import can
 
-from trirail_drivers.bus.own_frames import OwnFrames
 from trirail_drivers.bus.wire import Handler, Wire
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.config import Drives
-from trirail_drivers.driver.conversations import Wait, run_concurrently
-from trirail_drivers.errors import DriveError
+from trirail_drivers.driver.exclusive_bus import ExclusiveBus, Recognition, check_unused, watched_bus
 from trirail_drivers.interface import Clock, DriveFault
 
-LISTEN_TIME_S: Final = 0.5
-"""Shortest time spent listening for another master before the first frame is sent [s]; at least three heartbeats."""
 _COMMANDS: Final = {
     0x01: "start",
     0x02: "stop",
@@ -86,75 +81,39 @@ class OtherMasters:
         self._warn(f"has this service's node id {self._master_node}")
 
 
-class ExclusiveBus(can.BusABC):
-    """Bus that raises DriveError if another master sends a frame. Closing it does not close the inner bus."""
+def master_frames(drives: Drives, *, allow_sync: bool = False) -> Recognition:
+    """Return a function that recognises the frames of another master. With `allow_sync`, any node may send SYNC."""
+    nodes, master_node = [drive.node for drive in drives.each], drives.master_node
+    bases = {
+        canopen_frames.SDO_REQUEST: "accesses drives by SDO",
+        canopen_frames.RPDO1: "sends PDOs",
+        canopen_frames.RPDO2: "sends PDOs",
+    }
+    masters = {base + node: text for base, text in bases.items() for node in nodes}
+    masters[canopen_frames.NMT] = "commands by NMT"
+    if not allow_sync:
+        masters[canopen_frames.SYNC] = "sends SYNC"
+    masters[canopen_frames.HEARTBEAT + master_node] = f"sends the heartbeat of node {master_node}"
+    guarded = {canopen_frames.HEARTBEAT + node for node in nodes}
 
-    def __init__(self, bus: can.BusABC, drives: Drives, *, allow_sync: bool = False) -> None:
-        """With `allow_sync`, SYNC may come from other nodes."""
-        nodes, master_node = [drive.node for drive in drives.each], drives.master_node
-        self.inner = bus
-        self._own = OwnFrames(bus)
-        self.channel_info = bus.channel_info
-        bases = {
-            canopen_frames.SDO_REQUEST: "accesses drives by SDO",
-            canopen_frames.RPDO1: "sends PDOs",
-            canopen_frames.RPDO2: "sends PDOs",
-        }
-        self._masters = {base + node: text for base, text in bases.items() for node in nodes}
-        self._masters[canopen_frames.NMT] = "commands by NMT"
-        if not allow_sync:
-            self._masters[canopen_frames.SYNC] = "sends SYNC"
-        self._masters[canopen_frames.HEARTBEAT + master_node] = f"sends the heartbeat of node {master_node}"
-        self._guarded = {canopen_frames.HEARTBEAT + node for node in nodes}
-        super().__init__(channel=bus.channel_info)
+    def recognise(frame: can.Message) -> str:
+        if frame.is_remote_frame and frame.arbitration_id in guarded:
+            return "polls drives by node guarding"
+        return masters.get(frame.arbitration_id, "")
 
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame."""
-        self.inner.send(msg, timeout)
-        self._own.note(msg)
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Receive a frame. Raises DriveError if another master sent it."""
-        frame = self.inner.recv(timeout)
-        if frame is None or frame.is_error_frame or frame.is_extended_id or self._own.include(frame):
-            return frame
-        text = self._masters.get(frame.arbitration_id, "")
-        if frame.is_remote_frame and frame.arbitration_id in self._guarded:
-            text = "polls drives by node guarding"
-        if text:
-            raise DriveError(
-                f"another master is on the bus and {text} (identifier {frame.arbitration_id:03X}); "
-                "stop the service (trirail run) or the other program"
-            )
-        return frame
+    return recognise
 
 
-@contextmanager
-def exclusive_bus(bus: can.BusABC, drives: Drives, clock: Clock, *, allow_sync: bool = False) -> Iterator[ExclusiveBus]:
-    """Listen for another master without sending a frame, and yield a bus that continues to watch for one.
+def exclusive_bus(
+    bus: can.BusABC, drives: Drives, clock: Clock, *, allow_sync: bool = False
+) -> AbstractContextManager[ExclusiveBus]:
+    """Listen for another master without sending a frame, and return a bus that continues to watch for one.
 
     With `allow_sync`, SYNC may come from other nodes. Raises DriveError if another master sends a frame.
     """
-
-    async def listen() -> None:
-        await Wait(lambda _: False, clock() + max(LISTEN_TIME_S, 3.0 * drives.heartbeat))
-
-    with ExclusiveBus(bus, drives, allow_sync=allow_sync) as watched:
-        for end in run_concurrently(watched, clock, [listen()], lambda: "listening for another master"):
-            if end is not None:
-                raise end
-        yield watched
+    return watched_bus(bus, clock, master_frames(drives, allow_sync=allow_sync), 3.0 * drives.heartbeat)
 
 
 def check_exclusive(bus: can.BusABC, drives: Drives, clock: Clock) -> None:
-    """Raise DriveError if another master sends a frame before the drives are set up.
-
-    Frames received before the check are dropped, since they may be from this program, or from a service that has been
-    stopped in the meantime.
-    """
-    # The machine's clock ends this on a busy bus, since the clock of simulated drives does not advance here.
-    end = time.monotonic() + LISTEN_TIME_S
-    while time.monotonic() < end and bus.recv(0.0) is not None:
-        pass
-    with exclusive_bus(bus, drives, clock, allow_sync=True):
-        pass
+    """Raise DriveError if another master sends a frame before the drives are set up."""
+    check_unused(bus, clock, master_frames(drives, allow_sync=True), 3.0 * drives.heartbeat)

@@ -72,7 +72,7 @@ def run_concurrently(
             resume(at, None)
         while waits:
             due = min(reported + PROGRESS_PERIOD, *(wait.deadline for wait in waits.values()))
-            frame = _receive(bus, due - clock())
+            frame = receive(bus, due - clock())
             now = due if frame is None else clock()  # some buses return a little early
             if frame is not None:
                 observe(frame)
@@ -132,7 +132,7 @@ class BackgroundConversation(Generic[T]):
         self._conversation.close()
 
 
-def _receive(bus: can.BusABC, seconds: float) -> can.Message | None:
+def receive(bus: can.BusABC, seconds: float) -> can.Message | None:
     """Return a received frame, or None after some time. Raises BusError if the bus is lost."""
     try:
         frame = bus.recv(max(0.0, seconds))

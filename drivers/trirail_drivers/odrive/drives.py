@@ -32,6 +32,7 @@ from trirail_drivers.odrive import cansimple, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.lending import CycleTableWriter
+from trirail_drivers.odrive.other_masters import listen_for_masters
 from trirail_drivers.odrive.protections import describe_protection
 from trirail_drivers.odrive.returning import ReturningOdrive
 from trirail_drivers.odrive.setpoints import SetpointSender
@@ -73,6 +74,7 @@ class Odrive(Driver[OdriveAxis]):
                 self._wire.listen(
                     cansimple.identifier(axis.node, number), axis, axis.with_setup_listener(number, handler)
                 )
+        listen_for_masters(self._wire, self._axes)
         self._requests = tuple(cansimple.request(axis.node, cansimple.GET_ENCODER_ESTIMATES) for axis in self._axes)
         self._error_requests = tuple(cansimple.request(axis.node, cansimple.GET_ERROR) for axis in self._axes)
         self._next_request = 0

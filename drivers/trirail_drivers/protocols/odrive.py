@@ -10,6 +10,7 @@ from trirail_drivers.bus.load import TrafficPlan
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.odrive import cansimple, checks
 from trirail_drivers.odrive.drives import Odrive
+from trirail_drivers.odrive.other_masters import check_exclusive
 from trirail_drivers.odrive.protections import PROTECTIONS, describe_protection
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedOdrive
@@ -55,7 +56,7 @@ ODRIVE = Protocol(
     simulated_drive=_simulated_drive,
     inspect=None,
     inputs=None,
-    check_exclusive=None,
+    check_exclusive=check_exclusive,
     save=None,
     restore=None,
     protections={name: describe_protection(name) for name in PROTECTIONS},

@@ -48,10 +48,8 @@ class Protocol:
     Arguments: the bus, section [drives], the period [s], the clock, the velocity limit of the sliders [m/s], whether to
     `apply` the changes, the digital outputs and inputs `io` of each drive, and the `timing` of the bus.
     """
-    check_exclusive: Callable[[can.BusABC, config.Drives, Clock], None] | None
-    """Function that listens for another master, and raises DriveError if there is one; None if the protocol cannot tell
-    the frames of another master.
-    """
+    check_exclusive: Callable[[can.BusABC, config.Drives, Clock], None]
+    """Function that listens for another master, and raises DriveError if there is one."""
     save: Callable[..., dict[str, SavedParameters | DriveError]] | None
     """Function that reads the parameters of drives; None if the drives have no object dictionary.
 

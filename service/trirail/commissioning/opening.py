@@ -81,7 +81,7 @@ def open_steps(
             check = PROTOCOLS[config.drives.protocol].check_exclusive
             # No other program reaches simulated drives. Once a driver is made, a running service has stopped with a
             # fault, and some interfaces return the driver's own frames.
-            if driver is None and check is not None and clock is not simulated:
+            if driver is None and clock is not simulated:
                 check(bus, config.drives, clock)
             driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.timing, config.drives, clock)
             driver.configure(config.period, config.limits.slider.fastest)
