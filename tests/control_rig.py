@@ -173,11 +173,11 @@ class ControlRig:
         """Send a pose goal; return its answer."""
         return self.send(id, PoseGoal(x=x, y=y, phi=phi, speed=speed))
 
-    def send(self, id: str, goal: Goal) -> Answer:  # noqa: A002
-        """Send a goal; return its answer."""
+    def send(self, id: str, goal: Goal, within: int = 50) -> Answer:  # noqa: A002
+        """Send a goal; return its answer, which comes within so many cycles."""
         ticket = next(self._tickets)
         self.cycle(GoalRequest(ticket, "ann", id, goal, round(self.now * 1e9)))
-        self.until(lambda: self._answered(ticket), 50)
+        self.until(lambda: self._answered(ticket), within)
         return self._answer(ticket)
 
     def post(self, id: str, goal: Goal) -> None:  # noqa: A002

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 from control.sessions import Session, assert_within_limits
-from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
+from trirail.motion.paths import law_falls
+from trirail.wire.goal_kind import OwnLimits
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, VelocityGoal
 from trirail.wire.packets import CommandRequest
-from trirail.wire.vocabulary import Command, Stop
+from trirail.wire.vocabulary import Command, Mode, Stop
 
 
 @pytest.mark.parametrize("instant", [240, 270, 300, 330])
@@ -45,3 +50,174 @@ def test_a_goal_cancelled_while_the_robot_brakes_for_a_pause_breaks_no_limit() -
     session.until(lambda: len(session.ended) == 2)
     assert session.ended == {"g2": "stopped", "g1": "done"}
     assert_within_limits(session.config, session.records)
+
+
+# ---------------------------------------------------------------------- the override and goals that follow
+
+
+def long_move(session: Session, cycles: int) -> None:
+    """Go across the workspace at full speed, for so many cycles."""
+    session.post("s", PoseGoal(-0.11, 0.0, 0.0))
+    session.until(lambda: session.holds() and "s" in session.ended)
+    session.post("a", PoseGoal(0.11, 0.02, 0.1))
+    session.cycles(cycles)
+
+
+def rate(session: Session) -> float:
+    last = session.control.schedule.last
+    return last.law_state.rate if last is not None else 0.0
+
+
+@pytest.mark.parametrize("at", [20, 40, 70, 100, 150, 250])
+@pytest.mark.parametrize("override", [0.01, 0.05, 0.3, 0.8])
+def test_a_lower_override_acts_as_quickly_as_a_pause(override: float, at: int) -> None:
+    """While the robot accelerates, only a slow change fits at first, but not for long."""
+
+    def needed(command: Command, value: float | None, least: float) -> int:
+        session = Session()
+        long_move(session, at)
+        session.order(command, value)
+        cycles = session.until(lambda: rate(session) <= least)
+        assert session.control.fault is None
+        assert_within_limits(session.config, session.records)
+        return cycles
+
+    paused, lowered = needed(Command.PAUSE, None, 0.0), needed(Command.OVERRIDE, override, override)
+    assert lowered <= 1.5 * paused + 50
+
+
+OWN_ACCELERATION, OWN_JERK = 0.4, 4.0
+"""Of a goal, along x and y [m/s², m/s³]."""
+OWN = OwnLimits(
+    velocity=(0.1, 0.1, 1.0),
+    acceleration=(OWN_ACCELERATION, OWN_ACCELERATION, 5.0),
+    jerk=(OWN_JERK, OWN_JERK, 50.0),
+)
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.02])
+@pytest.mark.parametrize("wait", [5, 40, 80, 120])
+def test_behind_a_motion_above_full_speed_a_goal_keeps_its_own_limits(blend: float, wait: int) -> None:
+    session = Session()
+    session.order(Command.OVERRIDE, 2.0)
+    session.post("a", PoseGoal(0.03, 0.0, 0.0, speed=0.4, blend=blend))
+    session.cycles(wait)
+    session.post("b", PoseGoal(0.03, 0.08, 0.0, limits=OWN))
+    session.until(lambda: "a" in session.ended)
+    begun = len(session.records)
+    session.until(lambda: "b" in session.ended)
+    assert session.ended == {"a": "done", "b": "done"}
+    accelerations = session.records["commanded_pose_acceleration"][begun:, 1]
+    assert np.abs(accelerations).max() <= OWN_ACCELERATION * 1.001
+    assert np.abs(np.diff(accelerations)).max() / session.config.period <= OWN_JERK * 1.01
+
+
+@pytest.mark.parametrize("wait", [60, 100, 200])
+def test_a_goal_with_own_limits_preempts_a_motion_above_full_speed_within_them(wait: int) -> None:
+    session = Session()
+    session.order(Command.OVERRIDE, 2.0)
+    session.post("a", PoseGoal(0.1, 0.0, 0.0, speed=0.2))
+    session.cycles(wait)
+    session.post("b", PoseGoal(0.1, 0.05, 0.0, limits=OWN))
+    session.until(lambda: "a" in session.ended)
+    begun = len(session.records)
+    session.until(lambda: "b" in session.ended)
+    accelerations = session.records["commanded_pose_acceleration"][begun:, :2]
+    assert np.abs(accelerations).max() <= OWN_ACCELERATION * 1.001
+    assert np.abs(np.diff(accelerations, axis=0)).max() / session.config.period <= OWN_JERK * 1.01
+
+
+@pytest.mark.parametrize("how", ["ends", "stopped"])
+def test_the_override_acts_again_when_the_goal_that_forbids_it_has_gone(how: str) -> None:
+    """A goal with own limits runs at 100 % at most, and so does the motion before it, but not the next goal."""
+    session = Session()
+    session.order(Command.OVERRIDE, 2.0)
+    if how == "ends":
+        session.post("a", PoseGoal(0.02, 0.0, 0.0, blend=0.005, limits=OWN))
+        session.cycles(5)
+        session.post("b", PoseGoal(0.02, 0.1, 0.0, speed=0.2))
+        session.until(lambda: "a" in session.ended)
+    else:
+        session.post("a", PoseGoal(0.1, 0.0, 0.0, speed=0.1, blend=0.0))
+        session.cycles(5)
+        session.post("b", PoseGoal(0.1, 0.05, 0.0, limits=OWN))
+        session.until(lambda: len(session.control.ledger.goals) == 2)
+        assert rate(session) == 1.0
+        session.cycle(CommandRequest(99, "ann", Command.STOP, Stop("b")))
+    session.cycles(300)
+    assert rate(session) > 1.5
+    session.until(session.holds)
+    assert session.control.fault is None
+
+
+@pytest.mark.parametrize("every", [20, 100, 400])
+@pytest.mark.parametrize("override", [0.01, 0.03, 0.05])
+def test_a_renewed_jog_moves_at_every_override(override: float, every: int) -> None:
+    session = Session()
+    session.order(Command.OVERRIDE, override)
+    for cycle in range(8000):
+        if cycle % every == 0:
+            session.post("j", VelocityGoal(0.1, 0.0, 0.0, timeout=1.0))
+        else:
+            session.cycle()
+    assert 0.8 * 0.1 * override < session.control.commanded.velocity[0] < 1.001 * 0.1 * override
+
+
+@pytest.mark.parametrize("override", [1.1, 1.5, 2.0])
+@pytest.mark.parametrize("speeds", [(0.5,), (0.3, 1.0)])
+def test_corners_are_blended_at_every_override(override: float, speeds: tuple[float, ...]) -> None:
+    """A corner that fits at 100 % alone is planned for the override."""
+    session = Session()
+    session.order(Command.OVERRIDE, override)
+    corners = [(0.04, 0.0), (0.04, 0.04), (0.0, 0.04), (0.0, 0.0)]
+    for number in range(8):
+        x, y = corners[number % 4]
+        blend = 0.01 if number < 7 else None
+        session.post(f"g{number}", PoseGoal(x, y, 0.0, blend=blend, speed=speeds[number % len(speeds)]))
+        session.cycles(15)
+    slowest = math.inf
+    while session.mode is Mode.MOVING:
+        session.cycle()
+        last = session.control.schedule.last
+        if last is not None and last.remaining > 0.1 and len(session.control.ledger.goals) > 1:
+            slowest = min(slowest, math.hypot(*session.control.commanded.velocity[:2]))
+    assert slowest > 0.005
+    assert set(session.ended.values()) == {"done"}
+    assert_within_limits(session.config, session.records)
+
+
+def test_goals_that_blend_for_long_do_not_make_the_path_longer() -> None:
+    session = Session()
+    pieces = []
+    for number in range(200):
+        x = 0.01 * (number % 2)
+        session.post(f"g{number}", PoseGoal(x, 0.0, 0.0, blend=0.002))
+        session.cycles(8)
+        session.until(lambda: len(session.control.ledger.goals) <= 2)
+        last = session.control.schedule.last
+        assert last is not None
+        pieces.append(len(last.path.pieces))
+    assert max(pieces[100:]) <= max(pieces[:20])
+    session.until(session.holds)
+    assert len(session.ended) == 200
+    assert set(session.ended.values()) == {"done"}
+    assert_within_limits(session.config, session.records)
+
+
+@pytest.mark.parametrize("hours", [1e4, 1e5, 1e6])
+def test_rounding_after_hours_on_a_path_stops_nothing(hours: float) -> None:
+    """The time along the path is given in seconds, so that its last bit is then longer than a picosecond."""
+    last = np.nextafter(hours, 0.0)
+    knots, pieces = np.array([0.0, 1.0, 1e9]), np.zeros((2, 1, 6))
+    pieces[0, 0, 0], pieces[1, 0, 0] = hours, last
+    assert hours - last > 1e-12
+    assert not law_falls(knots, pieces)
+    pieces[1, 0, 0] = hours - 1e-8
+    assert law_falls(knots, pieces)
+
+
+def test_a_jog_that_is_almost_zero_raises_no_warning() -> None:
+    session = Session()
+    session.post("j", VelocityGoal(1e-200, 1e-220, 0.0))
+    session.cycles(100)
+    assert session.control.fault is None

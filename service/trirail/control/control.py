@@ -409,7 +409,7 @@ class Control:
             edge = StopAt(name, "rising" if value else "falling")
             if goal is not None and goal.stop_at == edge and self.state.has_goal and not self.state.released:
                 reached = coded(f"input {name} {edge.edge}", EventCode.INPUT_REACHED, input=name, x=x, y=y, phi=phi)
-                self.ledger.end("stopped", reached, but=1)
+                self.ledger.note_edge(reached)
                 self.modes.withdraw(ModeEvent.INPUT_EDGE, reached)
                 self.modes.apply_event(ModeEvent.INPUT_EDGE, reached)
                 self._close_outputs(goal.id, "stopped")  # at the edge, which is long before the rest

@@ -49,7 +49,7 @@ from trirail.kinematics.closure import inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.limits import BOUNDS, AllowedMotion, gate
-from trirail.motion.paths import MAX_TIME_FALL_S, law_at, platform_at
+from trirail.motion.paths import earliest_time, law_at, platform_at
 from trirail.wire.records import DTYPE
 
 __all__ = [
@@ -313,7 +313,7 @@ def command(
     if bounds[0].allowed == _BRAKED and target != 0.0:
         refused_values[0], refused_values[1] = target, rate
         refused = NOT_BRAKING
-    elif s >= furthest[0] - MAX_TIME_FALL_S:
+    elif s >= earliest_time(furthest[0]):
         furthest[0] = max(s, furthest[0])
         refused = _solve(legs, bounds, motion, sliders, backlash, refused_values)
     else:

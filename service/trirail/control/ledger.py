@@ -59,6 +59,8 @@ class ActiveGoal(NamedTuple):
     """Last reported pose of a track's target."""
     stop_at: StopAt | None = None
     """Edge of an input at which the goal ends."""
+    at_edge: EventText | None = None
+    """Text about that edge, after which the goal only brakes; None before the edge."""
     lag: float | None = None
     """Latest lag of a track behind its target; see trirail.wire.messages.GoalReply."""
 
@@ -161,6 +163,9 @@ class Ledger:
         goal, last = request.goal, self.goals[-1] if self.goals else None
         passes = at_end and last is not None and last.blend is not None and goal.follows
         if not plan.reply.queued and not passes:
+            if self.goals and (at_edge := self.goals[0].at_edge) is not None:  # this goal has ended, and only brakes
+                ended = self.goals.popleft()
+                self._end_goal(ended.id, ended.user, ended.kind, "done", at_edge)
             self.end("preempted", coded(f"preempted by goal {request.id}", EventCode.PREEMPTED, goal=request.id))
         begun = ActiveGoal(
             request.id,
@@ -212,6 +217,11 @@ class Ledger:
             text = coded(f"at the limit of {bound}", EventCode.STOPPED_AT_LIMIT) if bound else reason
             self._end_goal(goal.id, goal.user, goal.kind, outcome, text, bound, settled)
         self.goals.extend(kept)
+
+    def note_edge(self, reason: EventText) -> None:
+        """Record that the current goal has ended at the edge of an input, and end the goals that follow it."""
+        self.end("stopped", reason, but=1)
+        self.goals[0] = self.goals[0]._replace(at_edge=reason)
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
         """End a goal that has not begun, and answer the request with a refusal."""

@@ -100,8 +100,8 @@ class PlanRequests:
         """Delay of the last answer [cycles]."""
         self._since: int | None = None
         self._change: RateChange | None = None
-        self._greatest_rate = math.inf
-        """Greatest rate that the current goal allows."""
+        self._wanted_rate = 0.0
+        """Rate to which the current motion has been changed last, as far as its limits allow."""
 
     @property
     def busy(self) -> bool:
@@ -234,6 +234,8 @@ class PlanRequests:
         if self._request is not None and self._request.version != self._schedule.version:
             self._request = None  # the motion has changed since the request
         if self._request is None:
+            if self._awaits_lower_rate(self._goal):
+                return None
             if self._change is None or self._change.applied or self._change.cycles >= MAX_RATE_CHANGE_CYCLES:
                 self._request_plan(self._goal)
             return None
@@ -243,14 +245,36 @@ class PlanRequests:
 
     @property
     def _rate(self) -> float:
-        """Target rate of the current motion."""
-        return min(self.override, self._greatest_rate) if self._running else 0.0
+        """Target rate of the current motion: the override, or the lower rate that a goal on its path allows."""
+        if not self._running:
+            return 0.0
+        rate, last = self.override, self._schedule.last
+        if last is not None:
+            rate = min(rate, last.allowed_rate)
+        if self._goal is not None and self._extends_motion:
+            rate = min(rate, self._goal.greatest_rate)
+        return rate
+
+    @property
+    def _extends_motion(self) -> bool:
+        """Whether the goal being planned follows the current motion without preempting it."""
+        return self._blend is not None and self._schedule.last is not None and not self._schedule.ended
+
+    def _awaits_lower_rate(self, goal: Goal) -> bool:
+        """Whether the current motion is faster than the goal allows, so that the goal cannot follow on its path yet."""
+        last = self._schedule.last
+        if last is None or not self._extends_motion:
+            return False
+        return max(last.law_state.rate, last.target) > goal.greatest_rate
 
     def _start_rate_change(self) -> None:
         """Start changing the rate of the current motion to its target."""
+        self._wanted_rate = self._rate
         self._change = RateChange(self._scaling, self._schedule, self._rate, self._period)
 
     def _change_rate(self) -> None:
+        if self._running and self._rate != self._wanted_rate:  # a goal that allows only a lower rate has come or gone
+            self._start_rate_change()
         change = self._change
         if change is not None and (self._request is None or change.lowers_rate) and change.step():
             self._change = None
@@ -311,6 +335,7 @@ class PlanRequests:
             self._request = None  # too late
             return None
         run = self._planned_run or unpack_run(self._legs, planned.run)
+        run.greatest_rate = self._goal.greatest_rate if self._goal is not None else math.inf
         run.marks.append(self._marks(planned.switches))
         runs = deque([run])
         if planned.reply.stops_first and schedule.runs:
@@ -321,7 +346,7 @@ class PlanRequests:
         schedule.replace_runs(runs)
         # The goal begins in this cycle, and the mode changes to moving.
         self._running, self._change = True, None
-        self._greatest_rate = self._goal.greatest_rate if self._goal else math.inf
+        self._wanted_rate = self._rate
         if run.target != self._rate:
             self._start_rate_change()
         return AcceptedPlan(planned.reply, planned.bound)
@@ -329,8 +354,7 @@ class PlanRequests:
     def _stopping(self, under_way: Run, planned: PreemptingMotion) -> Run:
         """Return a copy of the current motion that stops on its path, without the goals that follow on the path."""
         run = under_way.copy()
-        run.seams.clear()
-        run.marks.clear()
+        run.withdraw_following()
         if planned.stop is not None:
             run.change_law(unpack_law(planned.stop), 0.0)
         return run
@@ -365,10 +389,8 @@ class PlanRequests:
         ):
             self._request = None
             return None
-        schedule.append(extended.s, path, self._marks(extended.switches))
-        if self._goal is not None and self._goal.greatest_rate < self._greatest_rate:
-            self._greatest_rate = self._goal.greatest_rate
-            self.update_rate()
+        greatest_rate = self._goal.greatest_rate if self._goal is not None else math.inf
+        schedule.append(extended.s, path, self._marks(extended.switches), greatest_rate)
         return AcceptedPlan(extended.reply.with_duration(schedule.remaining if run.target else math.inf))
 
 

@@ -80,8 +80,6 @@ class Transitions:
         """Reason for the first fault since the last reset."""
         self.entered = 0
         """Cycle in which the robot entered the current mode."""
-        self._edge: EventText | None = None
-        """Text about the input edge that has stopped the current goal; None if no edge has stopped the goal."""
         self.orders = 0
         """Number of commands to the drives, including those that wait."""
         self._waiting: list[Callable[[DriveGroup], None]] | None = None
@@ -114,10 +112,6 @@ class Transitions:
         if isinstance(decided, Refusal) or decided == Step(self.state):
             return  # repeated stops must not restart the search for a law that brakes
         self._act(decided)
-        if event is ModeEvent.INPUT_EDGE:
-            self._edge = reason
-        elif goal is not None:
-            self._edge = None
         before, self.state = self.state, decided.state
         if self.state.mode is not before.mode:
             self.entered = self.cycle
@@ -128,9 +122,9 @@ class Transitions:
             self._schedule.stop_on_path()  # also while the robot brakes; otherwise the next goal could begin
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = EventCode.RELEASED if before.released else EventCode.ARRIVED
-            at_end = self._edge if self._edge is not None else coded(arrived.value, arrived)
+            at_edge = self._ledger.goal.at_edge if self._ledger.goal is not None else None
+            at_end = at_edge or coded(arrived.value, arrived)
             self._ledger.end(outcome, at_end if outcome == "done" else reason)
-            self._edge = None
         if self.state.mode is not before.mode:
             begun = goal.id if goal is not None else None
             words = f"{self.state.mode}: {reason}"

@@ -24,10 +24,11 @@ from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goal_kind import import_all
 from trirail.wire.goals import Goal
 from trirail.wire.messages import GoalReply
+from trirail.wire.vocabulary import LOWEST_OVERRIDE
 
-MIN_REPLAN_RATE = 0.05
-"""Lowest rate of the current motion at which a new goal is planned without a stop. At lower rates, the robot first
-stops."""
+MIN_REPLAN_RATE = 0.9e-2 * LOWEST_OVERRIDE
+"""Lowest rate of the current motion at which a new goal is planned without a stop, just below the lowest override. At
+lower rates, the robot first stops."""
 STOP_SHARES = tuple(0.5**k for k in range(5))
 """Fractions of the greatest deceleration that are tried in turn if the robot must stop before it moves to a goal."""
 SLOWDOWN_STEP = 1.3
@@ -147,12 +148,14 @@ class GoalPlanner:
         self._motions[type(goal)].check(goal)
         at, end = self._blend_start(run, blend, lead), run.path.duration
         if at < end:
-            try:
-                plan = self._plan(goal, nominal_motion(run.path, at), 1.0, 0.0)
-                if self._fits(run, at, plan.path):
-                    return Extension.from_plan(at, plan)
-            except RefusedError:
-                pass
+            # With an override above 100 %, a path that is too fast under the law is planned for the rate of the law.
+            for rate in dict.fromkeys((1.0, max(1.0, run.law_state.rate, run.target))):
+                try:
+                    plan = self._plan_at_rate(goal, nominal_motion(run.path, at), rate)
+                    if self._fits(run, at, plan.path):
+                        return Extension.from_plan(at, plan)
+                except RefusedError:
+                    pass
         plan = self._plan(goal, rest(nominal_motion(run.path, end).pose), 1.0, 0.0)
         for _ in range(MAX_SLOWDOWNS):
             if self._fits(run, end, plan.path):
@@ -178,6 +181,8 @@ class GoalPlanner:
             schedule.runs[0].law_state.rate,
             1.0,
         ):  # the old path may allow a higher override than the new path
+            if now > goal.greatest_rate:
+                continue
             # The new path begins at the rate of the old path. In the time along the path, all velocities are therefore
             # divided by this rate.
             velocity = [value / now for value in start.velocity]
@@ -204,6 +209,18 @@ class GoalPlanner:
         duration = left + run.end_time if rate else math.inf
         reply = structs.replace(plan.reply.with_duration(duration), stops_first=True)
         return PlannedMotion(run, reply, plan.bound, stop=law)
+
+    def _plan_at_rate(self, goal: Goal, start: MotionState, rate: float) -> Plan:
+        """Return a path to the goal that stays within the limits if the time along the path runs at this rate.
+
+        `start` is the state of motion at full speed at the start of the path.
+        """
+        velocity = [value * rate for value in start.velocity]
+        acceleration = [value * rate**2 for value in start.acceleration]
+        plan = self._plan(goal, MotionState(start.pose, velocity, acceleration), rate, 0.0)
+        if rate == 1.0:
+            return plan
+        return Plan(stretched(plan.path, rate), structs.replace(plan.reply, slowed=rate * plan.reply.slowed))
 
     def _plan(self, goal: Goal, start: MotionState, rate: float, begins: float) -> Plan:
         """Return a path to the goal; see GoalMotion.plan."""

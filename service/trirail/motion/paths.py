@@ -24,6 +24,7 @@ __all__ = [
     "CENTRE_TOOLS",
     "Path",
     "constant_law",
+    "earliest_time",
     "evaluate",
     "is_valid_path",
     "law_at",
@@ -43,7 +44,9 @@ BISECTIONS = 48
 ROUNDING = 1e-9
 """Tolerance for rounding errors of positions and times [m, rad, s]."""
 MAX_TIME_FALL_S = 1e-12
-"""Greatest decrease of the time along a path that is treated as rounding [s]."""
+"""Greatest decrease of the time along a path that is treated as rounding, near the start of the path [s]."""
+RELATIVE_TIME_FALL = 4.0 * float(np.finfo(np.float64).eps)
+"""Greatest decrease that is treated as rounding after hours on a path, as a fraction of the time along the path."""
 CENTRE_TOOLS = np.zeros((0, 2))
 """Value of Path.tools for a path that describes the motion of the platform's centre."""
 
@@ -256,9 +259,15 @@ def is_valid_path(knots: Array, coefficients: Array, tools: Array) -> bool:
     return True
 
 
+@compiled()
+def earliest_time(s: float) -> float:
+    """Return the earliest time along a path that differs from the time `s` only by rounding [s]."""
+    return s - MAX_TIME_FALL_S - RELATIVE_TIME_FALL * abs(s)
+
+
 @compiled("b1(f8[::1], f8[:, :, ::1])")
 def law_falls(law_knots: Array, law_pieces: Array) -> bool:
-    """Return True if a law is invalid because the time along the path decreases by more than MAX_TIME_FALL_S.
+    """Return True if a law is invalid because the time along the path decreases by more than rounding.
 
     The pieces of a law are cubic. The extrema of the time along the path are therefore at knots, and at the zeros of
     the rate, which is a parabola. If a piece has a higher degree, the result is also True.
@@ -275,7 +284,7 @@ def law_falls(law_knots: Array, law_pieces: Array) -> bool:
         for t in (0.0, min(one, other), max(one, other), span):
             if 0.0 <= t <= span:
                 s = p[0] + t * (p[1] + t * (p[2] + t * p[3]))
-                if s < highest - MAX_TIME_FALL_S:
+                if s < earliest_time(highest):
                     return True
                 highest = max(highest, s)
     return False

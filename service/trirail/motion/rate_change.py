@@ -97,9 +97,9 @@ class RateChange:
     def _is_over(self, run: Run) -> bool:
         """Return True if the applied law is complete and needs no improvement.
 
-        A change to rate 0 is complete at rest. Any other change is complete when the rate is not below its target.
+        A change to rate 0 is complete at rest. Any other change is complete when the law has reached its target.
         """
-        return self.applied and (run.at_rest if self.rate == 0.0 else run.law_state.rate >= self._possible)
+        return self.applied and (run.at_rest if self.rate == 0.0 else run.time >= run.law.knots[-2])
 
     def _restart(self) -> None:
         """Restart the change from the current state of the motion."""
@@ -175,7 +175,7 @@ class RateChange:
         for _ in range(MAX_POSTPONEMENTS):
             at = run.law_state if cycles == 1 else run.law_state_at(run.time + (cycles - 1) * self._period)
             law = self._scaling.ramp(at, self._possible, CHANGE_SHARES[self._share])
-            if law is None or (self.applied and not self._stops_sooner(run, law, cycles)):
+            if law is None or (self.applied and not self._ends_sooner(run, law, cycles)):
                 return None
             ahead = self._parts(run, law, self._possible, float(law.knots[-2]) + self._period)
             if len(ahead) <= cycles:
@@ -183,11 +183,10 @@ class RateChange:
             cycles = len(ahead)
         return None
 
-    def _stops_sooner(self, run: Run, law: Path, cycles: int) -> bool:
-        """Return whether a law ends the run at least one cycle earlier than the present law."""
-        ends = run.path.duration
-        stands = arrival_time(law, self._possible, ends) if self._possible else float(law.knots[-2])
-        if (cycles - 1) * self._period + stands <= run.end_time - run.time - self._period:
+    def _ends_sooner(self, run: Run, law: Path, cycles: int) -> bool:
+        """Return whether a law completes the change at least one cycle earlier than the present law or the path."""
+        present = min(run.end_time, float(run.law.knots[-2])) - run.time
+        if (cycles - 1) * self._period + float(law.knots[-2]) <= present - self._period:
             return True
         self._share = -1  # slower changes would not end earlier either: try the quickest change next
         return False

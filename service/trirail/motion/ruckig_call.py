@@ -167,7 +167,9 @@ class Solver:
 
 def _is_parallel(rows: Array, direction: Array) -> bool:
     """Return whether all rows (..., 3) are parallel to a direction (3,), within rounding."""
-    across = rows - (rows @ direction)[..., None] * direction / (direction @ direction)
+    unit = direction / np.abs(direction).max()  # first by the largest component, since squares of tiny ones are 0
+    unit = unit / np.linalg.norm(unit)
+    across = rows - (rows @ unit)[..., None] * unit
     return bool(np.abs(across).max(initial=0.0) <= PARALLEL_TOLERANCE * max(1.0, float(np.abs(rows).max(initial=0.0))))
 
 

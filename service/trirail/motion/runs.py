@@ -77,6 +77,8 @@ class Seam(NamedTuple):
     """Time along the path [s]."""
     before: Path
     """Path without the next goal and the goals after it. Up to the seam, it equals the whole path."""
+    greatest_rate: float = math.inf
+    """Greatest rate that the next goal allows."""
 
 
 class GoalSpan(NamedTuple):
@@ -99,10 +101,14 @@ class Run:
         """Time since the start of the law [s]."""
         self.furthest = np.full(1, -np.inf)
         """Greatest time along the path that has been commanded, (1,) [s]. It never decreases."""
+        self.greatest_rate = math.inf
+        """Greatest rate that the current goal allows."""
         self.seams: deque[Seam] = deque()
         self.marks: deque[GoalMarks] = deque()
         """Marks of the current goal and of the following goals on the path, in order; empty if no goal has marks."""
         self._begun = 0.0
+        self._withdrawn: Seam | None = None
+        """Seam at the end of the current goal, if the goals after it have been withdrawn but the path is longer."""
         self._goal_span = GoalSpan(0.0, 0.0, 0.0)
         self._span_law: Path | None = None
         self._legs = legs
@@ -135,7 +141,8 @@ class Run:
     @property
     def goal_span(self) -> GoalSpan:
         """Span of the current goal, computed again only after a change of the law or of the goal."""
-        begun, end = self._begun, self.seams[0].s if self.seams else self.path.duration
+        begun, seam = self._begun, self._next_seam
+        end = seam.s if seam is not None else self.path.duration
         if self._span_law is not self.law or self._goal_span[:2] != (begun, end):
             self._goal_span, self._span_law = GoalSpan(begun, end, self.arrival_at(end)), self.law
         return self._goal_span
@@ -164,7 +171,18 @@ class Run:
 
     def destination(self, near: Sequence[float]) -> Sequence[float]:
         """Return the target pose of the current goal. For a path in slider space, `near` selects the branch."""
-        return self._end_of(self.seams[0].before if self.seams else self.path, near)
+        seam = self._next_seam
+        return self._end_of(seam.before if seam is not None else self.path, near)
+
+    @property
+    def _next_seam(self) -> Seam | None:
+        """Seam at the end of the current goal; None if the goal ends with the path."""
+        return self.seams[0] if self.seams else self._withdrawn
+
+    @property
+    def allowed_rate(self) -> float:
+        """Greatest rate that all goals on the path allow."""
+        return min((self.greatest_rate, *(seam.greatest_rate for seam in self.seams)))
 
     def end(self, near: Sequence[float]) -> Sequence[float]:
         """Return the pose at the end of the path, which is the target of the last goal; `near` selects the branch."""
@@ -179,19 +197,22 @@ class Run:
         """Return an independent copy of the run."""
         other = Run(self._legs, self.path, self.law, self.target)
         other.time, other.seams, other._begun = self.time, self.seams.copy(), self._begun
+        other.greatest_rate, other._withdrawn = self.greatest_rate, self._withdrawn
         other.furthest[:] = self.furthest
         other.marks = self.marks.copy()
         return other
 
-    def append(self, s: float, path: Path, marks: GoalMarks | None = None) -> None:
+    def append(self, s: float, path: Path, marks: GoalMarks | None = None, greatest_rate: float = math.inf) -> None:
         """Replace the path after the time `s` by another path, which begins with the same state of motion.
 
-        Marks of earlier goals after `s` are not used, unless the new goal is dropped.
+        Marks of earlier goals after `s` are not used, unless the new goal is dropped. The part of the path that the
+        motion has passed is removed, so that the path does not grow as long as goals follow each other.
         """
-        longer = joined([cut(self.path, s), path])
+        before = remaining(self.path, self.law_state.s)
+        longer = joined([cut(before, s), path])
         self.marks.append(marks or GoalMarks())
         self.marks[-1].begin = s
-        self.seams.append(Seam(s, self.path))
+        self.seams.append(Seam(s, before, greatest_rate))
         self.path = longer
 
     def drop(self, number: int) -> None:
@@ -202,11 +223,18 @@ class Run:
             if self.marks:
                 self.marks.pop()
 
+    def withdraw_following(self) -> None:
+        """Withdraw the goals after the current goal, and all marks. The path does not change."""
+        self._withdrawn = self._next_seam
+        self.seams.clear()
+        self.marks.clear()
+
     def pass_seams(self) -> int:
         """Remove the seams that the motion has passed. Return the number of goals that have thereby ended."""
         s, passed = self.law_state.s, 0
         while self.seams and s >= self.seams[0].s:
-            self._begun = self.seams.popleft().s
+            seam = self.seams.popleft()
+            self._begun, self.greatest_rate, self._withdrawn = seam.s, seam.greatest_rate, None
             if self.marks:
                 self.marks.popleft()
             passed += 1
@@ -295,6 +323,15 @@ def joined(paths: Sequence[Path]) -> Path:
     if any(len(path.tools) for path in paths):
         tools = np.concatenate([path.tools if len(path.tools) else np.zeros((len(path.pieces), 2)) for path in paths])
     return Path(np.concatenate(knots), np.concatenate([path.pieces for path in paths]), paths[0].in_sliders, tools)
+
+
+def remaining(path: Path, s: float) -> Path:
+    """Return a path without the pieces that end before the piece which precedes the time `s` [s].
+
+    The times along the path do not change, so that its first knot may be later than zero.
+    """
+    first = max(0, int(np.searchsorted(path.knots, s, side="right")) - 2)
+    return path._replace(knots=path.knots[first:], pieces=path.pieces[first:], tools=path.tools[first:])
 
 
 def cut(path: Path, s: float) -> Path:

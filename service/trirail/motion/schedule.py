@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -80,9 +81,9 @@ class Schedule:
         self.runs = runs
         self.version += 1
 
-    def append(self, s: float, path: Path, marks: GoalMarks | None = None) -> None:
+    def append(self, s: float, path: Path, marks: GoalMarks | None = None, greatest_rate: float = math.inf) -> None:
         """Extend the last run by the path of another goal; see Run.append."""
-        self.runs[-1].append(s, path, marks)
+        self.runs[-1].append(s, path, marks, greatest_rate)
         self.version += 1
 
     def drop(self, number: int) -> None:
@@ -100,8 +101,7 @@ class Schedule:
         while len(self.runs) > 1:
             self.runs.pop()
         for run in self.runs:
-            run.seams.clear()
-            run.marks.clear()
+            run.withdraw_following()
         self.version += 1
 
     def advance(self) -> int:
