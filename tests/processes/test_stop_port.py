@@ -308,6 +308,26 @@ def test_an_address_that_is_taken_is_told_with_the_remedy_and_the_service_goes_o
     assert not any("no stop port" in warning for warning in guard.warnings())
 
 
+def test_a_file_that_is_no_socket_is_kept_and_told_with_the_remedy(tmp_path: Path) -> None:
+    config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=(f"unixsock-stream/{tmp_path}/z",)))
+    guard = Guard(config)
+    for name in ("z", "z.stop"):
+        (tmp_path / name).write_text("notes")
+    with pytest.raises(ServiceError, match=r"cannot listen on .*/z: this file exists and is not a socket; move it aw"):
+        guard.open()
+    guard.stop_port(lambda *_: None).close()
+    assert any(f"no stop port at {tmp_path}/z.stop (this file exists" in warning for warning in guard.warnings())
+    assert [(tmp_path / name).read_text() for name in ("z", "z.stop")] == ["notes", "notes"]
+    for name in ("z", "z.stop"):
+        (tmp_path / name).unlink()
+        with socket.socket(socket.AF_UNIX) as left:  # by a gateway that was killed
+            left.bind(str(tmp_path / name))
+    guard.stop_port(lambda *_: None).close()
+    assert not any("no stop port" in warning for warning in guard.warnings())
+    with guard.open():
+        pass
+
+
 ELSEWHERE = "192.0.2.1"
 
 

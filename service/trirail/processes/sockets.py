@@ -111,7 +111,11 @@ def listen(address: StopAddress) -> list[socket.socket]:
     """Listen on a Unix socket, or on every address of a host name that this machine has. Raises OSError on failure."""
     if isinstance(address.where, str):
         # A gateway that was killed may have left the socket. Zenoh's lock file shows that no other gateway is running.
-        Path(address.where).unlink(missing_ok=True)
+        file = Path(address.where)
+        if file.is_socket():
+            file.unlink()
+        elif os.path.lexists(file):
+            raise FileExistsError(errno.EEXIST, "this file exists and is not a socket; move it away", address.where)
         places: list[tuple[socket.AddressFamily, Any]] = [(socket.AF_UNIX, address.where)]
     else:
         host, port = address.where

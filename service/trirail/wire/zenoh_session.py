@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ import zenoh
 from trirail.errors import ServiceError
 from trirail.wire.credentials import Credentials
 from trirail.wire.dialling import connection_problem
-from trirail.wire.endpoints import DEFAULT_LOCATOR, leads_to
+from trirail.wire.endpoints import DEFAULT_LOCATOR, leads_to, socket_file
 from trirail.wire.sizes import MAX_TRANSPORT
 from trirail.wire.starting import is_starting
 
@@ -53,6 +54,11 @@ def open_service(
     name in Zenoh's configuration. The session connects to the routers at the locators `connect`, and reconnects when a
     connection is lost. Raises ServiceError if the session cannot be opened.
     """
+    for file in filter(None, map(socket_file, listen)):
+        if os.path.lexists(file) and not file.is_socket():  # Zenoh would delete the file
+            raise ServiceError(
+                f"cannot listen on {file}: this file exists and is not a socket; move it away, or change zenoh.listen"
+            )
     settings = {"mode": "peer", **serving(listen, credentials, access_control, connect)}
     return _open(
         settings,
