@@ -86,12 +86,15 @@ class HeapTrim:
         if now < self._due:
             return
         self._due = now + TRIM_EVERY
-        resident = _resident()
+        try:
+            resident = _resident()
+        except OSError:  # no descriptor is free, for example in a flood of connections
+            return
         self._least = min(self._least, resident)
         if resident > self._least + TRIM_ABOVE:
             return_free_memory()
 
 
 def _resident() -> int:
-    """Return the resident memory of this process [bytes], from /proc/self/statm, proc(5)."""
+    """Return the resident memory of this process [bytes], from /proc/self/statm, proc(5). Raises OSError."""
     return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")

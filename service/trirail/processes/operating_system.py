@@ -107,7 +107,7 @@ def notify(state: str) -> None:
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
         # Errors are ignored, because a failure of systemd must not prevent a stop of the robot.
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, contextlib.suppress(OSError):
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
             sender.settimeout(SEND_WITHIN)
             sender.connect("\0" + address[1:] if address.startswith("@") else address)
             sender.send(state.encode())

@@ -35,7 +35,10 @@ def descriptor_limit() -> int:
 def descriptors_used() -> int:
     """Return the number of file descriptors that this process has open."""
     counted = Path("/proc/self/fd").stat().st_size  # the number since Linux 6.2; 0 in earlier versions
-    return counted or len(os.listdir("/proc/self/fd")) - 1  # listing the folder uses one descriptor itself
+    try:
+        return counted or len(os.listdir("/proc/self/fd")) - 1  # listing the folder uses one descriptor itself
+    except OSError:  # no descriptor is free
+        return descriptor_limit()
 
 
 def connections(ports: Container[int]) -> list[tuple[str, int]]:
@@ -63,8 +66,15 @@ def _address(written: str) -> tuple[str, int]:
 
 
 def disconnect(peers: Container[tuple[str, int]]) -> None:
-    """Shut down every connection of this process to these hosts and ports, including connections of libraries."""
-    for number in map(int, os.listdir("/proc/self/fd")):
+    """Shut down every connection of this process to these hosts and ports, including connections of libraries.
+
+    This needs two free descriptors. If there are none, no connection is shut down.
+    """
+    try:
+        numbers = os.listdir("/proc/self/fd")
+    except OSError:
+        return
+    for number in map(int, numbers):
         with contextlib.suppress(OSError):  # the descriptor has been closed meanwhile, or is not connected
             if not stat.S_ISSOCK(os.fstat(number).st_mode):
                 continue

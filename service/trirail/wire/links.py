@@ -204,7 +204,7 @@ class Port:
             return False
         try:
             connected, _ = self._listening.accept()
-        except BlockingIOError:
+        except OSError:  # no peer wants to connect, or no descriptor is free; the peer then continues to wait
             return False
         self._link = PacketLink(connected)
         return True
