@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ from trirail.wire import links
 from waiting import WITHIN
 
 SERVER = """
-import json, os, signal, sys, threading, time
+import errno, json, os, signal, sys, threading, time
 from pathlib import Path
 from typing import Any
 from trirail.processes import compiling, fork_server
@@ -59,6 +60,18 @@ def work(child):
         if (folder / child.name).exists():
             exec((folder / child.name).read_text())
 
+def failing(name):
+    call = getattr(os, name)
+
+    def failed(*arguments):
+        if (folder / f"no-{{name}}").exists():
+            raise BlockingIOError(errno.EAGAIN, "no more processes")
+        return call(*arguments)
+
+    setattr(os, name, failed)
+
+failing("fork")
+failing("pidfd_open")
 compiling.load, compiling.compile_all = load, compile_all
 """
 
@@ -73,6 +86,12 @@ class Parent:
         sockets = [listening.fileno() for listening in self.listening]
         self.children: list[ChildProcess] = []
         self.warm = ForkServerLink(Order(load(SIM), None), folder, self.heartbeats, sockets)
+
+    @property
+    def server(self) -> subprocess.Popen[bytes]:
+        process: Any = self.warm._process
+        assert isinstance(process, subprocess.Popen)
+        return process
 
     def child(self, name: str, record: str | None = None) -> ChildProcess:
         self.children.append(ChildProcess(self.warm, name, record))
@@ -151,6 +170,26 @@ def test_how_a_child_ends_is_told_and_another_takes_its_place(does: str, how: st
     second = parent.child("gateway")
     parent.until_said(second)
     assert second.pid != first.pid
+
+
+@pytest.mark.parametrize("call", ["fork", "pidfd_open"])
+@pytest.mark.parametrize("name", ["gateway", "loop"])
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_child_that_cannot_be_forked_is_told_with_the_reason_and_another_can(
+    call: str, name: str, kept: bool, parent: Parent
+) -> None:
+    """Also where what fails is the fork of the compiler."""
+    if not kept:
+        (parent.folder / "kept").unlink()
+        (parent.folder / "compiler").write_text("(folder / 'kept').touch()")
+    (parent.folder / f"no-{call}").touch()
+    child = parent.child(name)
+    assert parent.until_over(child) == "the system starts no process: no more processes"
+    assert os.read(child.pipe, 1) == b""
+    server = parent.server.pid
+    assert Path(f"/proc/{server}/task/{server}/children").read_text() == ""
+    (parent.folder / f"no-{call}").unlink()
+    parent.until_said(parent.child(name))
 
 
 def test_a_signal_that_comes_before_a_child_handles_it_is_not_lost(parent: Parent) -> None:

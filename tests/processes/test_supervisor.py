@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -62,6 +63,7 @@ def work(child):
 CONFIG = load(SIM)
 TURNING = "ready(); beat_until(never)"
 RECORDING = "ready(); rest(); freeze()"
+DYING = "ready(); beat_until(lambda: begun('up')); os._exit(1)"
 HANGING = "ready(); beat_until(lambda: begun('up')); freeze()"
 SERVING = (
     "ready(); beat_until(lambda: heartbeats.heart('loop').count); (folder / 'serving.begun').touch(); "
@@ -183,6 +185,27 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
         "up",
         f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; restarting it",
     ]
+
+
+def test_a_process_for_which_the_supervisor_has_no_descriptor_is_started_later(
+    run: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipe = os.pipe
+
+    def no_pipe() -> tuple[int, int]:
+        if len(run.told) == 2:  # up, and that the recorder has died
+            raise OSError(errno.ENFILE, "too many files")
+        return pipe()
+
+    monkeypatch.setattr(os, "pipe", no_pipe)
+    run.ends(
+        1,
+        loop_1="ready(); beat_until(lambda: begun('recorder-2')); heartbeats.heart('loop').rest()",
+        gateway_1=SERVING,
+        recorder_1=DYING,
+        recorder_2="ready()",
+    )
+    assert run.told[2] == "cannot restart the recorder (too many files): trying again in 1 s"
 
 
 @pytest.mark.core

@@ -73,6 +73,8 @@ class ChildEnd(msgspec.Struct, frozen=True, tag=True):
 
     number: int
     code: int
+    reason: str = ""
+    """Reason for people, if the child could not be forked."""
 
 
 prepare(Fork)
@@ -110,10 +112,11 @@ class ForkServer:
                 elif not self._receive():
                     return
             for request in filter(self._can_be_met, list(self._requests)):
-                pidfd, pid = self._fork(request, work, WITH_PARENT.get(request.fork.name))
-                self._children[pidfd] = request.fork.number
-                self._send(ChildStart(request.fork.number, pid), pidfd)
-                self._done(request)
+                if (forked := self._fork(request, work, WITH_PARENT.get(request.fork.name))) is not None:
+                    pidfd, pid = forked
+                    self._children[pidfd] = request.fork.number
+                    self._send(ChildStart(request.fork.number, pid), pidfd)
+                    self._done(request)
 
     def _receive(self) -> bool:
         """Receive a request. Return False if the supervisor has disconnected."""
@@ -130,8 +133,9 @@ class ForkServer:
         if request.fork.name not in MATHEMATICS or not self._cache_works:
             return True
         if self._compiler is None and not compiling.load():
-            pidfd, _ = self._fork(request, _compile, signal.SIGKILL)
-            self._compiler = pidfd, request
+            if (forked := self._fork(request, _compile, signal.SIGKILL)) is not None:
+                self._compiler = forked[0], request
+            return False
         return self._compiler is None
 
     def _done(self, request: _Request) -> None:
@@ -140,23 +144,38 @@ class ForkServer:
 
     def _fork(
         self, request: _Request, work: Callable[[Child], int], with_parent: signal.Signals | None
-    ) -> tuple[int, int]:
-        """Fork a child; return its pidfd and its process id.
+    ) -> tuple[int, int] | None:
+        """Fork a child; return its pidfd and its process id. If that fails, report the end of the child; return None.
 
         If `with_parent` is given, the kernel sends this signal to the child when the fork server ends.
         """
         parent = os.getpid()
         gc.freeze()  # otherwise, a child's garbage collector would write to shared memory pages, and thereby copy them
-        pid = os.fork()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            self._on_failure(request, error)
+            return None
         if pid == 0:
             if with_parent is not None:
                 die_with_parent(with_parent)
             if os.getppid() != parent:
                 os._exit(0)
             self._become(request, work)
-        pidfd = os.pidfd_open(pid)
+        try:
+            pidfd = os.pidfd_open(pid)
+        except OSError as error:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            self._on_failure(request, error)
+            return None
         self._poll.register(pidfd, select.POLLIN)
         return pidfd, pid
+
+    def _on_failure(self, request: _Request, error: OSError) -> None:
+        """Report that a child could not be forked. The supervisor may request it again."""
+        self._send(ChildEnd(request.fork.number, os.EX_OSERR, f"the system starts no process: {error.strerror}"))
+        self._done(request)
 
     def _become(self, request: _Request, work: Callable[[Child], int]) -> NoReturn:
         """Run the child's work in the forked process, after closing the descriptors of the other children."""

@@ -116,7 +116,7 @@ class ForkServerLink:
             if child.name in MATHEMATICS:
                 self.report_timeout = END_REPORT_TIMEOUT_S
         else:
-            self._requested.pop(message.number).ended(message.code)
+            self._requested.pop(message.number).ended(message.code, message.reason)
 
     def wait_for_message(self) -> bool:
         """Wait for the next message. Return False on a time-out.
@@ -171,6 +171,7 @@ class ChildProcess:
         self._partial_line = b""
         self.ready_message: dict[str, Any] | None = None
         self._hung_for = 0.0
+        self._reason = ""
         self.pipe, write = os.pipe()
         os.set_blocking(self.pipe, False)
         parent.fork(self, record, write, again=again)
@@ -182,9 +183,9 @@ class ChildProcess:
         if self._killed:
             self.send_signal(signal.SIGKILL)
 
-    def ended(self, code: int) -> None:
-        """Record the end of the process."""
-        self.returncode = code
+    def ended(self, code: int, reason: str = "") -> None:
+        """Record the end of the process, or the reason why it could not be forked."""
+        self.returncode, self._reason = code, reason
         if self._pidfd is not None:
             os.close(self._pidfd)
             self._pidfd = None
@@ -252,6 +253,8 @@ class ChildProcess:
     def end_description(self) -> str:
         """Description for people of how the child ended."""
         code = self.returncode
+        if self._reason:
+            return self._reason
         return describe_exit(code, self._hung_for) if code else "another process sent it SIGTERM"
 
 

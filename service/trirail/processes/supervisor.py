@@ -289,7 +289,11 @@ class Supervisor:
     def _start_due(self) -> None:
         for name in [name for name, due in self._due.items() if due <= time.monotonic()]:
             del self._due[name]
-            self._start(name)
+            try:
+                self._start(name)
+            except OSError as error:  # no descriptor is free for the pipe
+                self._report(f"cannot restart the {name} ({error.strerror}): trying again in 1 s", "warning")
+                self._due[name] = time.monotonic() + 1.0
 
     def _fail(self, reason: str) -> None:
         self._failed = self._ending = True
