@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import tempfile
 from pathlib import Path
@@ -185,6 +186,21 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
         "up",
         f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; restarting it",
     ]
+
+
+def test_each_restart_of_a_gateway_waits_longer_than_the_one_before(
+    run: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses = (0.0, 0.05, 0.1, 0.15, 0.2)
+    monkeypatch.setattr(supervisor, "RESTART_PAUSES_S", pauses)
+    dying = {f"gateway_{number}": "os._exit(1)" for number in range(2, 7)}
+    run.ends(1, loop_1=TURNING, gateway_1=DYING, **dying)
+    died = "the gateway has died (exit code 1): the loop stops the robot and holds its position; restarting it"
+    assert run.told[1:6] == [died, *(f"{died} in {pause:g} s" for pause in pauses[1:])]
+    assert run.told[6] == "the gateway has died repeatedly (exit code 1): the service ends"
+    began = [(run.folder / f"gateway-{number}.begun").stat().st_mtime for number in range(1, 7)]
+    waited = [after - before for before, after in itertools.pairwise(began)]
+    assert all(wait > pause - 0.01 for wait, pause in zip(waited, pauses, strict=True))
 
 
 def test_a_process_for_which_the_supervisor_has_no_descriptor_is_started_later(

@@ -60,8 +60,12 @@ RESTART_DURING_START = 1.0
 
 It is long enough to notice that the loop has ended, in which case the process is not restarted.
 """
-RESTARTS = 5
-"""Maximum number of restarts of one process within a minute without a pause."""
+RESTART_PAUSES_S = (0.0, 0.1, 0.3, 1.0, 3.0)
+"""Pauses before the restarts of one process within a minute [s].
+
+The first restart is immediate, because the robot holds its position until the gateway is back. The pauses become
+longer, so that the restarts are not used up while a short shortage of memory or processes lasts.
+"""
 CHECK_PERIOD_S = 0.1
 """Interval between two checks of the other processes [s]."""
 MAX_SILENCE_S = 0.7
@@ -72,9 +76,9 @@ MAX_RECORDER_SILENCE_S = 5.0
 It is longer, because the recorder may wait for a disk, and no motion depends on the recorder.
 """
 RETRY_PAUSE_S = 10.0
-"""Pause before the recorder or the planner is restarted again after RESTARTS restarts [s].
+"""Pause before the recorder or the planner is restarted again after all RESTART_PAUSES_S [s].
 
-If the gateway ends again after RESTARTS restarts, the service ends.
+If the gateway ends again after that number of restarts, the service ends.
 """
 
 
@@ -265,8 +269,9 @@ class Supervisor:
             return
         now = time.monotonic()
         restarts[:] = [moment for moment in restarts if now - moment < 60.0] + [now]
-        wait = 0.0 if len(restarts) <= RESTARTS else RETRY_PAUSE_S
-        if wait and name == "gateway":
+        used_up = len(restarts) > len(RESTART_PAUSES_S)
+        wait = RETRY_PAUSE_S if used_up else RESTART_PAUSES_S[len(restarts) - 1]
+        if used_up and name == "gateway":
             self._fail(f"the gateway has died repeatedly ({child.end_description}): the service ends")
             return
         when = f" in {wait:g} s" if wait else ""
