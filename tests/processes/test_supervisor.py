@@ -262,11 +262,11 @@ for number in range({FUNCTIONS}):
     assert run.told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]
 
 
-@pytest.mark.parametrize("sent", ["SIGINT", "SIGHUP"])
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGQUIT", "SIGHUP", "SIGTSTP", "SIGTTIN", "SIGTTOU"])
 def test_the_terminals_interrupt_and_end_reach_no_child_not_even_one_that_is_still_importing(
     sent: str, run: Running
 ) -> None:
-    """Ctrl-C, and its own end, go to all of the terminal's processes: the supervisor alone acts on it."""
+    """Ctrl-C, Ctrl-Z and its own end go to all of the terminal's processes: the supervisor alone acts on it."""
     interrupted = f"os.kill(os.getpid(), signal.{sent}); ready(); "
     turning = "beat_until(lambda: begun('up')); heartbeats.heart('loop').rest()"
     run.ends(1, loop_1=interrupted + turning, gateway_1=interrupted + "freeze()")
@@ -274,7 +274,22 @@ def test_the_terminals_interrupt_and_end_reach_no_child_not_even_one_that_is_sti
 
 
 @pytest.mark.usefixtures("patient")
-@pytest.mark.parametrize("sent", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_a_service_cannot_be_suspended_and_says_how_it_ends(run: Running) -> None:
+    """After Ctrl-Z, and in the background of a terminal that lets nobody write."""
+    suspending = "".join(f"os.kill({os.getpid()}, signal.{sent}); " for sent in ("SIGTTIN", "SIGTTOU", "SIGTSTP"))
+    stopping = "def end(*_): heartbeats.heart('loop').rest(); os._exit(0)\nsignal.signal(signal.SIGTERM, end)\n"
+    ending = f"beat_until(lambda: begun('told-2')); os.kill({os.getpid()}, signal.SIGQUIT); beat_until(never)"
+    loop = f"{stopping}ready(); beat_until(lambda: begun('up')); {suspending}{ending}"
+    run.ends(0, loop_1=loop, gateway_1=SERVING, recorder_1=SERVING)
+    assert run.told == [
+        "up",
+        "SIGTSTP: the service cannot be suspended; Ctrl-C stops the robot and ends the service",
+        "SIGQUIT: stopping the robot and disabling the drives",
+    ]
+
+
+@pytest.mark.usefixtures("patient")
+@pytest.mark.parametrize("sent", ["SIGTERM", "SIGINT", "SIGQUIT", "SIGHUP"])
 def test_a_start_that_is_interrupted_has_not_failed(sent: str, run: Running) -> None:
     """SIGTERM ends the children before they have said what it is to do."""
     interrupting = f"os.kill({os.getpid()}, signal.{sent}); freeze()"

@@ -41,8 +41,18 @@ WITH_PARENT: Final = {"loop": signal.SIGTERM, "drives": signal.SIGTERM, "planner
 Gateway and recorder receive no signal. They end by themselves after the loop, once the loop's last messages have been
 published and written to disk.
 """
-TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
-"""Signals that a terminal sends to all of its processes: on Ctrl-C, and when the terminal is closed."""
+TERMINAL_SIGNALS: Final = (
+    signal.SIGINT,
+    signal.SIGQUIT,
+    signal.SIGHUP,
+    signal.SIGTSTP,
+    signal.SIGTTIN,
+    signal.SIGTTOU,
+)
+"""Signals that a terminal sends to all of its processes.
+
+It sends them on Ctrl-C, Ctrl-\\ and Ctrl-Z, when it is closed, and when a process in the background uses it.
+"""
 ALLOCATOR_ENVIRONMENT: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
 """Environment for Rerun's allocator, so that it does not reserve memory in advance."""
 MAX_PACKET_BYTES = 4096

@@ -67,9 +67,10 @@ def _children(process: int) -> list[int]:
 
 
 class Signals:
-    """Receiver of SIGTERM, SIGINT and SIGHUP, whose socket `reader` can be passed to select.
+    """Receiver of the signals that end the service and of SIGTSTP, whose socket `reader` can be passed to select.
 
-    Under nohup, SIGHUP is still ignored. The kernel may deliver a signal to any thread, but Python runs its handlers
+    SIGTSTP, SIGTTIN and SIGTTOU do not stop the process, because it must not freeze while the robot moves. Under nohup,
+    SIGHUP is still ignored. The kernel may deliver a signal to any thread, but Python runs its handlers
     only in the main thread, which may be waiting for a lock. A signal in another thread would not wake the main thread.
     Data in a socket does.
     """
@@ -77,10 +78,12 @@ class Signals:
     def __enter__(self) -> Signals:
         self.reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
-        numbers = [signal.SIGTERM, signal.SIGINT]
+        numbers = [signal.SIGTERM, signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
             numbers.append(signal.SIGHUP)
         self._before = {number: signal.signal(number, lambda _signal, _frame: None) for number in numbers}
+        for number in (signal.SIGTTIN, signal.SIGTTOU):
+            self._before[number] = signal.signal(number, signal.SIG_IGN)
         self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
         return self
 

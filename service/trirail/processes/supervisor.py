@@ -182,9 +182,7 @@ class Supervisor:
             # Handle the loop first: if the loop has ended, the other processes end because of that.
             for child in sorted(senders, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
-                    ending = progress.interrupted if not self._up else "stopping the robot and disabling the drives"
-                    self._report(f"{signals.first().name}: {ending}", "info")
-                    self._ending = True
+                    self._on_signal(signals.first(), progress)
                 elif not child.read_messages() and not self._ending:
                     self._on_end(child)
                 if child is not None:
@@ -210,6 +208,15 @@ class Supervisor:
             elif time.monotonic() - max(began, self._progress_at) > START_WITHIN:
                 missing = ", ".join(name for name in self._names if name not in ready)
                 raise ServiceError(f"the service did not start within {START_WITHIN:g} s; still starting: {missing}")
+
+    def _on_signal(self, number: signal.Signals, progress: Progress) -> None:
+        if number == signal.SIGTSTP:
+            words = "the service cannot be suspended; Ctrl-C stops the robot and ends the service"
+            self._report(f"{number.name}: {words}", "warning")
+            return
+        ending = progress.interrupted if not self._up else "stopping the robot and disabling the drives"
+        self._report(f"{number.name}: {ending}", "info")
+        self._ending = True
 
     def _kill_hung(self) -> None:
         """Check all processes once per CHECK_PERIOD_S, and kill hung processes. `_on_end` then handles their end."""
