@@ -9,16 +9,19 @@ import signal
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import pytest
 from processes.test_service import (
     END_WITHIN,
     UP_WITHIN,
     ColdService,
+    Process,
     Service,
     again,
     assert_stopped_smoothly,
     in_motion,
+    planned_again,
     service,
     until,
 )
@@ -161,6 +164,48 @@ def test_a_killed_parent_leaves_nobody_and_a_complete_recording(name: str, servi
     recorded = recording(service)
     assert outcomes(recorded) == [("long", "stopped")]
     assert MODES[recorded.records["mode"][-1]] is Mode.DISABLED
+
+
+def test_a_log_that_nobody_reads_neither_keeps_a_process_from_its_restart_nor_the_robot_from_its_stop(
+    tmp_path: Path,
+) -> None:
+    with BlockedService(tmp_path) as service:
+        service.block()
+        with again(service) as robot:
+            robot.enable()
+            os.kill(service.child("planner"), signal.SIGKILL)
+            planned_again(robot)
+            in_motion(robot)
+            service.process.send_signal(signal.SIGTERM)
+            assert service.process.wait(END_WITHIN) == 0
+    assert_stopped_smoothly(service)
+
+
+class BlockedService(Service):
+    """One whose output goes to a pipe."""
+
+    def start(self, path: Path, log: IO[bytes]) -> Process:
+        """Start it, with the pipe."""
+        self._reader, writer = os.pipe()
+        with open(writer, "wb") as output:
+            return super().start(path, output)
+
+    def block(self) -> None:
+        """Let it come up, and then fill the pipe, which nobody reads any more."""
+        read = b""
+        while b"up  robot" not in read:
+            read += os.read(self._reader, 65_536)
+        writer = os.open(f"/proc/self/fd/{self._reader}", os.O_WRONLY | os.O_NONBLOCK)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(writer, bytes(65_536))
+        os.close(writer)
+
+    def __exit__(self, *of: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        super().__exit__(*of)
+        os.close(self._reader)
 
 
 def wait_gone(process: int) -> None:

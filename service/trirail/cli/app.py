@@ -86,11 +86,12 @@ def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Litera
         if form == "json":
             lines.log(f"up: robot {settings.robot.name}, goals {', '.join(settings.zenoh.listen)}")
         else:
-            with suppress(OSError, SystemExit):  # on a full disk or a closed pipe, Rich would exit
+            with terminal.out.capture() as printed:
                 terminal.up(settings, ready)
+            lines.text(printed.get())
 
     try:
-        return Supervisor(settings, record, lines.log, lines.event).run(up)
+        return Supervisor(settings, record, lines.log, lines.event).run(up, lines.start)
     finally:
         starting.up()
         lines.close()

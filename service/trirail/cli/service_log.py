@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import queue
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -22,31 +24,78 @@ RATE: Final = 1.0
 """Lines per second after a burst, so that a flood of goals cannot fill the disk. Errors are always written."""
 PRIORITIES: Final[Mapping[str, int]] = {"info": 6, "warning": 4, "error": 3}
 """Priority of each level, which journald reads at the beginning of a line: sd-daemon(3)."""
+MAX_WAITING: Final = 1000
+"""Maximum number of lines that wait while the output is blocked; further lines are dropped and counted."""
+FLUSH_WITHIN: Final = 1.0
+"""Maximum time for writing the lines that wait when the service ends [s]."""
+
+
+def unbuffered(stream: TextIO) -> Callable[[str], None]:
+    """Return a function that writes to a stream without Python's buffer.
+
+    A blocked write would hold the lock of the buffer, for which the interpreter would wait when it ends.
+    """
+
+    def write(text: str) -> None:
+        content = text.encode(stream.encoding, "backslashreplace")
+        while content:
+            content = content[os.write(stream.fileno(), content) :]
+
+    return write
 
 
 class Log:
-    """Writer of lines with time and level."""
+    """Writer of lines with time and level.
+
+    After `start`, a thread writes the lines, so that a reader who does not read cannot block the service.
+
+    Parameters
+    ----------
+    write
+        Function that writes a text and may block; None for standard output.
+
+    """
 
     def __init__(
         self,
         form: Form,
-        out: TextIO | None = None,
+        write: Callable[[str], object] | None = None,
         clock: Callable[[], float] = time.time,
         environment: Mapping[str, str] = os.environ,
     ) -> None:
         self._json = form == "json"
-        self._out = out or sys.stdout
+        self._write = write or unbuffered(sys.stdout)
         self._clock = clock
         self._to_journal = "JOURNAL_STREAM" in environment
         self._newest = 0
         self._room = float(BURST)
         self._looked = clock()
         self._left_out = 0
+        self._waiting: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._dropped = 0
+        """Number of lines dropped since the output was blocked. No line waits after the first dropped line."""
+
+    def start(self) -> None:
+        """Start the thread. Before, lines are written by the caller, because a process with threads must not fork."""
+        self._thread = threading.Thread(target=self._run, name="log", daemon=True)
+        self._thread.start()
 
     def log(self, words: str, level: Level = "info") -> None:
         """Write a message of the service about itself."""
-        now = self._clock()
-        self._write(now, level, words, {"time": now, "kind": "service", "level": level, "message": words})
+        self.text(self._own_line(words, level))
+
+    def text(self, text: str) -> None:
+        """Write a text as it is."""
+        if self._thread is None:
+            self._write_now(text)
+            return
+        with self._lock:
+            if self._dropped or self._waiting.qsize() >= MAX_WAITING:
+                self._dropped += 1
+            else:
+                self._waiting.put(text)
 
     def event(self, event: Event) -> None:
         """Write an event, but only once, because a restarted gateway sends past events again."""
@@ -61,7 +110,7 @@ class Log:
             self.log(f"{number} events came too quickly to be written here: `trirail events` has them", "warning")
             self._room -= 1.0
         self._room -= 1.0
-        self._write(event.time, event.level, event.message, event)
+        self.text(self._line(event.time, event.level, event.message, event))
 
     def _has_room(self) -> bool:
         now = self._clock()
@@ -69,22 +118,33 @@ class Log:
         self._looked = now
         return self._room >= 1.0
 
-    def _write(self, moment: float, level: Level, words: str, content: object) -> None:
+    def _own_line(self, words: str, level: Level) -> str:
+        now = self._clock()
+        return self._line(now, level, words, {"time": now, "kind": "service", "level": level, "message": words})
+
+    def _line(self, moment: float, level: Level, words: str, content: object) -> str:
         if self._json:
-            line = json_printable(msgspec.json.encode(content).decode())
-        else:
-            line = f"{wall_clock(moment)}  {level:7}  {printable(words)}"
-            if self._to_journal:
-                line = f"<{PRIORITIES[level]}>{line}"
+            return json_printable(msgspec.json.encode(content).decode()) + "\n"
+        line = f"{wall_clock(moment)}  {level:7}  {printable(words)}\n"
+        return f"<{PRIORITIES[level]}>{line}" if self._to_journal else line
+
+    def _run(self) -> None:
+        """Write the lines that wait, until `close`."""
+        while (text := self._waiting.get()) is not None:
+            self._write_now(text)
+            with self._lock:
+                dropped = self._dropped if self._waiting.empty() else 0
+                self._dropped -= dropped
+            if dropped:
+                words = f"the output was blocked: {dropped} lines of this log are missing"
+                self._write_now(self._own_line(words, "warning"))
+
+    def _write_now(self, text: str) -> None:
         with suppress(OSError):  # a full disk or a closed pipe must not stop the robot
-            self._out.write(f"{line}\n")
-            self._out.flush()
+            self._write(text)
 
     def close(self) -> None:
-        """Flush the output; discard lines that cannot be written, which the interpreter would try to write at exit."""
-        try:
-            self._out.flush()
-        except OSError:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._out.fileno())
-            os.close(nowhere)
+        """Write the lines that wait, as far as the output takes them within FLUSH_WITHIN."""
+        if self._thread is not None:
+            self._waiting.put(None)
+            self._thread.join(FLUSH_WITHIN)

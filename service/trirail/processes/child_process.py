@@ -37,7 +37,7 @@ HAPPENED = "happened"
 MEASURED = "measured"
 """Key of a message with measurements for the metrics."""
 LOG_WITHIN = 0.05
-"""Time after which a log line is dropped if the pipe is full because the supervisor's output is blocked [s]."""
+"""Time after which a log line is dropped if the pipe is full because the supervisor is too slow [s]."""
 DRIVES: Final = "drives"
 """Name of the process of the simulated drives, and of the socket of that process in the service's runtime folder."""
 DRIVES_WITHIN: Final = 60.0

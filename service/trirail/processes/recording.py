@@ -137,7 +137,8 @@ class Intake:
     def _warn(self, text: EventText) -> None:
         """Write a warning to the service's log, and announce it to all clients."""
         with contextlib.suppress(OSError):  # the log may be on the full disk
-            print(f"trirail: recorder: {text}", file=sys.stderr, flush=True)  # noqa: T201 - the log
+            if select.select([], [sys.stderr], [], 0.0)[1]:  # otherwise the reader of the log does not read
+                print(f"trirail: recorder: {text}", file=sys.stderr, flush=True)  # noqa: T201 - the log
         self._announce("warning", text)
 
     def _announce(self, level: Level, text: EventText) -> None:

@@ -134,10 +134,13 @@ class Supervisor:
         self._loop_has_run = False
         self._up = False
 
-    def run(self, up: Callable[[dict[str, dict[str, Any]]], None]) -> int:
+    def run(
+        self, up: Callable[[dict[str, dict[str, Any]]], None], start_threads: Callable[[], None] = lambda: None
+    ) -> int:
         """Run the service until a signal arrives or the service must end; return the exit code.
 
-        `up` is called once when all processes are ready, with the ready message of each process.
+        `up` is called once when all processes are ready, with the ready message of each process. `start_threads` is
+        called after the fork of the fork server. Before, this process must have a single thread.
         """
         raise_descriptor_limit()
         with _runtime_folder() as folder, Signals() as signals:
@@ -147,6 +150,7 @@ class Supervisor:
             self._parent = ForkServerLink(self._order, folder, self._heartbeats, sockets)
             self._selector.register(self._parent, selectors.EVENT_READ)
             try:
+                start_threads()
                 with _metrics_server(self._order.config, self._health):  # after the fork, because it starts a thread
                     self._run_children(up, signals)
             finally:
