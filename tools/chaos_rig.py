@@ -124,7 +124,7 @@ class Rig:
         runtime = self.folder / "runtime"
         runtime.mkdir(exist_ok=True)
         self._log = (self.folder / "service.log").open("w+b")
-        self.service = own_service.start(self.config, self._log, XDG_RUNTIME_DIR=str(runtime))
+        self.service = own_service.start(self.config, self._log, TMPDIR=str(runtime))
 
     @property
     def locator(self) -> str:

@@ -95,12 +95,12 @@ PREFIX = "trirail-run-"
 
 
 @contextmanager
-def temporary_folder(parent: str | None = None) -> Iterator[Path]:
+def temporary_folder() -> Iterator[Path]:
     """Create a folder and remove it afterwards. Also remove the folders of this user's processes that were killed.
 
     A folder is in use while a process has locked it; the lock ends with the process. Raises OSError.
     """
-    base = Path(parent or tempfile.gettempdir())
+    base = Path(tempfile.gettempdir())
     for left in base.glob(f"{PREFIX}*"):
         _remove_unused(left)
     folder, lock = _locked_folder(base)

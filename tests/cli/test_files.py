@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -167,17 +168,21 @@ def test_a_text_that_is_too_long_keeps_its_beginning_and_its_end(text: str, long
 
 
 HOLDS = """
-import sys, time
+import time
 from trirail_drivers import files
-with files.temporary_folder(sys.argv[1]) as folder:
+with files.temporary_folder() as folder:
     (folder / "socket").touch()
     print(folder, flush=True)
     time.sleep(600)
 """
 
 
-def test_a_temporary_folder_that_a_killed_process_has_left_goes_with_the_next_one_and_no_other(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", HOLDS, str(tmp_path)]
+def test_a_temporary_folder_that_a_killed_process_has_left_goes_with_the_next_one_and_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    command = [sys.executable, "-c", HOLDS]
     others = [tmp_path / name for name in ("trirail-other", "run-trirail-run-", "file")]
     for other in others:
         other.mkdir()
@@ -189,7 +194,7 @@ def test_a_temporary_folder_that_a_killed_process_has_left_goes_with_the_next_on
             folders = [Path(each.stdout.readline().strip()) for each in (living, killed) if each.stdout]
             killed.kill()
         assert all((folder / "socket").exists() for folder in folders)
-        with files.temporary_folder(str(tmp_path)) as folder:
+        with files.temporary_folder() as folder:
             assert set(tmp_path.iterdir()) == {*kept, folders[0], folder}
         assert set(tmp_path.iterdir()) == {*kept, folders[0]}
         living.kill()

@@ -394,17 +394,19 @@ def _admission(config: Config) -> Admission | None:
 
 @contextmanager
 def _runtime_folder() -> Iterator[Path]:
-    """Create a temporary folder for sockets, which exists within the context. Raises ServiceError on failure."""
-    parent = os.environ.get("XDG_RUNTIME_DIR")
+    """Create a temporary folder for sockets, which exists within the context. Raises ServiceError on failure.
+
+    The folder is not in XDG_RUNTIME_DIR, because systemd removes that folder when the user's last session ends. The
+    service may continue, and its restarted processes need the sockets. systemd-tmpfiles does not clean this folder,
+    because the folder is locked, tmpfiles.d(5).
+    """
     with ExitStack() as stack:
         try:
-            folder = stack.enter_context(files.temporary_folder(parent))
+            folder = stack.enter_context(files.temporary_folder())
         except OSError as error:
-            where = f"{parent} (XDG_RUNTIME_DIR)" if parent else "any folder for temporary files"
             raise ServiceError(
-                f"cannot make a folder for sockets in {where}: {error.strerror}; "
-                f"{'unset XDG_RUNTIME_DIR, or ' if parent else ''}set {'it' if parent else 'TMPDIR'} to a folder of "
-                "this user"
+                f"cannot make a folder for sockets in any folder for temporary files: {error.strerror}; set TMPDIR to "
+                "a folder of this user"
             ) from error
         yield folder
 
@@ -416,7 +418,7 @@ def _listen(folder: Path) -> list[socket.socket]:
     except OSError as error:  # usually because the kernel allows only 107 bytes for the path of a socket
         raise ServiceError(
             f"cannot make sockets in {folder}: {error.strerror or error}; "
-            "set XDG_RUNTIME_DIR, or TMPDIR if there is none, to another folder of this user with a short path"
+            "set TMPDIR to another folder of this user with a short path"
         ) from error
 
 
