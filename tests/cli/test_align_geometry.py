@@ -262,17 +262,81 @@ def test_a_map_that_helps_is_written_beside_the_configuration_that_names_it(tmp_
     found = stage.drive(calibrate_geometry(GeometryTask(robot, room(settings.limits), FIELD_PX, poses=60, looks=1)))
     usable = align_geometry._usable_map(found, settings, quiet=True)
     assert usable is not None
-    written = align_geometry._write(found, config, settings, out, tmp_path / "camera.json", stage.look(), usable)
+    written, _ = align_geometry._write(found, config, settings, out, tmp_path / "camera.json", stage.look(), usable)
     assert written.map == tmp_path / "new-map.toml"
     read = load(out).correction.as_built  # allowed with the new geometry and the limits
     assert read is not None
     assert as_built.format_map(read) == as_built.format_map(usable)
     out.rename(config)  # the map stays, under the name by which the configuration finds it
-    again = align_geometry._write(found, config, settings, out, tmp_path / "camera.json", stage.look(), usable)
+    again, _ = align_geometry._write(found, config, settings, out, tmp_path / "camera.json", stage.look(), usable)
     assert again.map == tmp_path / "new-map-2.toml"
     assert load(out).correction.map == str(again.map)
-    without = align_geometry._write(
+    without, _ = align_geometry._write(
         found, config, settings, tmp_path / "plain.toml", tmp_path / "camera.json", stage.look(), None
     )
     assert (without.map, load(tmp_path / "plain.toml").correction.as_built) == (None, None)
     assert without.old_cameras == tmp_path / "camera.json.old"
+
+
+# The measured geometry differs by more than 1 µm, so at least one of these poses needs a slider beyond its travel.
+AT_LIMITS = """
+[poses]
+left = [-0.009999, 0.0, 0.0]
+right = [0.009999, 0.0, 0.0]
+"""
+
+
+def test_a_measurement_is_kept_when_a_named_pose_is_beyond_a_limit_with_it(tmp_path: Path) -> None:
+    config, out, camera = tmp_path / "uvw.toml", tmp_path / "new.toml", tmp_path / "camera.json"
+    config.write_text(SIM.with_name("uvw.toml").read_text(encoding="utf-8") + AT_LIMITS, encoding="utf-8")
+    settings, rng = load(config), np.random.default_rng(8)
+    robot = geometry(settings.geometry)
+    part = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
+    views = {name: wide_camera(rng, at) for name, at in part.items()}
+    stage = BuiltStage(robot, built_otherwise(robot, rng, 50e-6, 1e-4), (0.0, 0.0, 0.0), views, part, rng, 0.05)
+    found = stage.drive(calibrate_geometry(GeometryTask(robot, room(settings.limits), FIELD_PX, poses=20, looks=1)))
+    written, failures = align_geometry._write(found, config, settings, out, camera, stage.look(), None)
+    assert written == (out, camera, None, None)
+    (failure,) = failures
+    with pytest.raises(ConfigError, match=r"poses\.(left|right) = ") as refused:  # the service says the same
+        load(out)
+    assert str(refused.value) in str(failure)
+    text = out.read_text(encoding="utf-8")
+    assert str(refused.value).removeprefix(f"{out}: ") in text.splitlines()[1]
+    for name in ("left", "right"):  # the person corrects the poses, and the file is valid
+        text = text.replace(f"{name} = [", f"{name} = [0.5e-3, 0.0, 0.0] # [")
+    assert as_built.geometry_of(geometry(parse(text).geometry)) == as_built.geometry_of(found.geometry)
+    assert calibration_file.read(camera).geometry == as_built.geometry_of(found.geometry)
+
+
+def test_the_cameras_are_kept_when_the_configuration_cannot_be_written(tmp_path: Path) -> None:
+    config, camera = tmp_path / "uvw.toml", tmp_path / "camera.json"
+    config.write_text(SIM.with_name("uvw.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    settings, rng = load(config), np.random.default_rng(8)
+    robot = geometry(settings.geometry)
+    views = {"left": wide_camera(rng, (-0.06, 0.0)), "right": wide_camera(rng, (0.06, 0.0))}
+    part = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
+    stage = BuiltStage(robot, robot, (0.0, 0.0, 0.0), views, part, rng, 0.05)
+    found = stage.drive(calibrate_geometry(GeometryTask(robot, room(settings.limits), FIELD_PX, poses=20, looks=1)))
+    written, failures = align_geometry._write(found, config, settings, config, camera, stage.look(), None)
+    assert (written.config, written.cameras, camera.exists()) == (None, camera, True)
+    assert "already exists" in str(failures[0])
+    written, failures = align_geometry._write(found, config, settings, None, tmp_path, stage.look(), None)
+    assert (written.config, written.cameras) == (tmp_path / "uvw-calibrated.toml", None)
+    assert load(tmp_path / "uvw-calibrated.toml")
+    assert str(tmp_path) in str(failures[0])
+
+
+@pytest.mark.slow
+def test_the_values_are_printed_when_a_named_pose_is_beyond_a_limit_with_them(
+    stage: tuple[Path, str], tmp_path: Path
+) -> None:
+    service, *given = options(stage, tmp_path)
+    config, out = tmp_path / "uvw.toml", tmp_path / "new.toml"
+    config.write_text(Path(str(service)).read_text(encoding="utf-8") + AT_LIMITS, encoding="utf-8")
+    done = warm.trirail("align", "geometry", config, *given, "--out", out, "--yes", "--json")
+    assert done.returncode == 1, done.stderr
+    found = json.loads(done.stdout)
+    assert found["written"]["config"] == str(out)
+    assert "poses." in found["errors"][0]
+    assert found["parameters"]["B encoder scale"] != 0.0

@@ -12,7 +12,7 @@ from trirail_drivers import files
 from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.mark_source import MarkSource
 from trirail.cli.options import HERE, Flag, Service
-from trirail.errors import ConfigError
+from trirail.errors import ConfigError, TrirailError
 
 if TYPE_CHECKING:
     from trirail.alignment.camera_calibration import Marks
@@ -100,20 +100,27 @@ def geometry(
     if not service.json:
         alignment_lines.show_geometry(result, settings.geometry.labels)
     asks = not yes and not service.json
-    usable, written = _usable_map(result, settings, quiet=service.json), _Written()
+    usable = _usable_map(result, settings, quiet=service.json)
+    written, failures = _Written(), list[TrirailError]()
     if yes or (asks and _answers_yes("Write a new configuration with these values?")):
         if asks and usable is not None and not _answers_yes("Write the map too, as [correction] map?"):
             usable = None
-        written = _write(result, config, settings, out, calibration, targets, usable)
+        written, failures = _write(result, config, settings, out, calibration, targets, usable)
     remarks = _remarks(settings, taught)
     if service.json:
         files = {name: None if path is None else str(path) for name, path in written._asdict().items()}
-        terminal.json(_content(result) | {"made_before": remarks, "written": files})
-    elif written.config is None:
-        terminal.print_line("nothing is written")
-    else:
+        errors = [str(each) for each in failures]
+        terminal.json(_content(result) | {"made_before": remarks, "written": files, "errors": errors})
+    elif any(written):
         _report(written, config, remarks)
-    return 0
+    else:
+        terminal.print_line("nothing is written")
+    if failures and not service.json:
+        if written.config is None:
+            terminal.json(_content(result))  # with all digits, so that the values can be entered by hand
+        for failure in failures:
+            terminal.print_error(str(failure))
+    return 1 if failures else 0
 
 
 def _check_same(settings: Config, path: Path, robot: Robot) -> None:
@@ -173,27 +180,44 @@ def _write(
     cameras: Path,
     targets: Marks,
     errors: AsBuilt | None,
-) -> _Written:
-    """Write the configuration, the calibration of the cameras, and the map. Raises ConfigError or FileError."""
+) -> tuple[_Written, list[TrirailError]]:
+    """Write the configuration, the calibration of the cameras, and the map.
+
+    Return the files that were written, and the errors. A measurement takes long, so an error does not prevent the other
+    files.
+    """
     from trirail.client import calibration_file
     from trirail.commissioning import config_edit
     from trirail.config import as_built
 
-    written = out or config_edit.find_free_path(path, "calibrated")
-    map_path = config_edit.find_free_path(written, "map") if errors is not None else None
-    text = files.text(path)
-    if written.parent.resolve() != path.parent.resolve():
-        text = config_edit.resolve_paths(text, path.parent)
-    text = config_edit.edit_geometry(text, result.geometry, result.scales, map_path.name if map_path else None)
-    if settings.can.interface == "simulated" and settings.can.simulated.built is None:
-        text = config_edit.add_simulated_build(text, settings.drives)
-    if map_path is not None and errors is not None:
-        config_edit.write_new_file(map_path, as_built.format_map(errors))
-    config_edit.write_new_file(written, text)
-    old = calibration_file.keep_old(cameras)
-    geometry_id = as_built.geometry_of(result.geometry)
-    calibration_file.write(cameras, settings.robot.name, result.cameras, targets, geometry=geometry_id)
-    return _Written(written, cameras, old, map_path)
+    written, failures = _Written(), list[TrirailError]()
+    try:
+        old = calibration_file.keep_old(cameras)
+        geometry_id = as_built.geometry_of(result.geometry)
+        calibration_file.write(cameras, settings.robot.name, result.cameras, targets, geometry=geometry_id)
+        written = written._replace(cameras=cameras, old_cameras=old)
+    except TrirailError as error:
+        failures.append(error)
+    new = out or config_edit.find_free_path(path, "calibrated")
+    map_path = config_edit.find_free_path(new, "map") if errors is not None else None
+    try:
+        if map_path is not None and errors is not None:
+            config_edit.write_new_file(map_path, as_built.format_map(errors))
+            written = written._replace(map=map_path)
+        text = files.text(path)
+        if new.parent.resolve() != path.parent.resolve():
+            text = config_edit.resolve_paths(text, path.parent)
+        text = config_edit.edit_geometry(text, result.geometry, result.scales, map_path.name if map_path else None)
+        if settings.can.interface == "simulated" and settings.can.simulated.built is None:
+            text = config_edit.add_simulated_build(text, settings.drives)
+        text, mistake = config_edit.mark_mistake(text, errors)
+        config_edit.write_new_file(new, text)
+        written = written._replace(config=new)
+        if mistake is not None:
+            failures.append(ConfigError(f"{new}: {mistake}; correct it before you start the service with this file"))
+    except TrirailError as error:
+        failures.append(error)
+    return written, failures
 
 
 def _remarks(settings: Config, taught: list[str]) -> list[str]:
@@ -208,12 +232,14 @@ def _remarks(settings: Config, taught: list[str]) -> list[str]:
 
 
 def _report(written: _Written, path: Path, remarks: list[str]) -> None:
-    terminal.print_line(f"written to {written.config}; {path} is unchanged. Cameras and targets: {written.cameras}")
+    names = {"configuration": written.config, "cameras and targets": written.cameras, "map": written.map}
+    for name, file in names.items():
+        if file is not None:
+            terminal.print_line(f"{name} written to {file}")
     if written.old_cameras is not None:
         terminal.print_line(f"previous file saved as {written.old_cameras}")
-    if written.map is not None:
-        terminal.print_line(f"map: {written.map}")
-    terminal.print_line(f"It takes effect when the service is started again: trirail run {written.config}")
+    if written.config is not None:
+        terminal.print_line(f"{path} is unchanged. To use the new configuration: trirail run {written.config}")
     terminal.print_line("Made with the previous geometry:")
     for remark in remarks:
         terminal.print_line(f"  {remark}")

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import msgspec
 import tomlkit
+from msgspec import structs
 from tomlkit.items import Table
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES, Triple
 
-from trirail.config import Config, Tls, geometry, parse
-from trirail.config.as_built import geometry_of
+from trirail.config import Config, Tls, check, geometry, parse_values
+from trirail.config.as_built import AsBuilt, geometry_of
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry
 
@@ -22,6 +22,13 @@ def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
 
     Raises ConfigError if the result is not a valid configuration, or if any other value has changed.
     """
+    result = _replace_text(text, changes)
+    check(_without_map(result))
+    return result
+
+
+def _replace_text(text: str, changes: Mapping[str, int | float]) -> str:
+    """Return the result of `edit_text`, without the checks of its values against each other."""
     document = tomlkit.parse(text)
     for path, value in changes.items():
         *tables, key = path.split(".")
@@ -44,7 +51,7 @@ def _without_map(text: str) -> Config:
     document = tomlkit.parse(text)
     if "correction" in document:
         document["correction"].pop("map", None)
-    return parse(tomlkit.dumps(document))
+    return parse_values(tomlkit.dumps(document))
 
 
 def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | None) -> str:
@@ -52,14 +59,17 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
 
     The real position of each slider is (1 + scale) times its reading. The reading contains the offset of the drive. If
     there is an offset, it is therefore corrected too. The correction map of the old geometry is removed. `map_file` is
-    the name of a new correction map; None for no map. Raises ConfigError if the result is not a valid configuration, or
-    if any other value has changed.
+    the name of a new correction map; None for no map.
+
+    A new geometry can make other values of the file impossible, for example a named pose at a limit. The result is
+    therefore not checked for this; see `mark_mistake`. Raises ConfigError if a key does not accept its new value, or if
+    any other value has changed.
     """
     document = tomlkit.parse(text)
     if "correction" in document:
         for key in ("map", "as_built"):
             document["correction"].pop(key, None)
-    before = parse(tomlkit.dumps(document))
+    before = parse_values(tomlkit.dumps(document))
     section = document["geometry"]
     rows = [{key: _rounded(value) for key, value in leg.keys().items()} for leg in robot.each]
     if "leg" in section:
@@ -79,9 +89,9 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
         axes[f"drives.{name}.counts_per_metre"] = float(f"{drive.counts_per_metre / (1.0 + scale):.12g}")
         if drive.offset * scale:
             axes[f"drives.{name}.offset"] = float(f"{drive.offset * (1.0 + scale):.12g}")
-    result = edit_text(tomlkit.dumps(document), axes)
-    after = parse(result)
-    expected = msgspec.structs.replace(replace_values(before, axes), geometry=after.geometry)
+    result = _replace_text(tomlkit.dumps(document), axes)
+    after = parse_values(result)
+    expected = structs.replace(replace_values(before, axes), geometry=after.geometry)
     if after != expected or geometry_of(geometry(after.geometry)) != geometry_of(robot):
         raise ConfigError("the new geometry cannot be written to this file; edit it by hand")
     if map_file is None:
@@ -89,6 +99,19 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
     document = tomlkit.parse(result)
     document.setdefault("correction", tomlkit.table())["map"] = map_file
     return tomlkit.dumps(document)
+
+
+def mark_mistake(text: str, errors: AsBuilt | None) -> tuple[str, str | None]:
+    """Return a configuration's text and None, or the text with a comment on its first mistake, and the mistake.
+
+    `errors` is the content of the correction map that the text names.
+    """
+    values = _without_map(text)
+    try:
+        check(structs.replace(values, correction=structs.replace(values.correction, as_built=errors)))
+    except ConfigError as error:
+        return f"# The service does not start with this file until you correct this:\n# {error}\n\n{text}", str(error)
+    return text, None
 
 
 def _rounded(value: object) -> object:
@@ -103,9 +126,9 @@ def replace_values(config: Config, changes: Mapping[str, int | float]) -> Config
     drives = config.drives
     for path, value in changes.items():
         _, name, key = path.split(".")
-        drive = msgspec.structs.replace(getattr(drives, name), **{key: value})
-        drives = msgspec.structs.replace(drives, **{name: drive})
-    return msgspec.structs.replace(config, drives=drives)
+        drive = structs.replace(getattr(drives, name), **{key: value})
+        drives = structs.replace(drives, **{name: drive})
+    return structs.replace(config, drives=drives)
 
 
 def add_simulated_build(text: str, drives: Drives) -> str:

@@ -2,8 +2,8 @@
 
 from trirail.config.digital import Input, Output
 from trirail.config.explained import Mistake, overlap, wrong_values
-from trirail.config.impossible import check_as_built
-from trirail.config.loading import SIM, Findings, everything, load, parse, toml_tables
+from trirail.config.impossible import check, check_as_built
+from trirail.config.loading import SIM, Findings, everything, load, parse, parse_values, toml_tables
 from trirail.config.network_checks import check_reach
 from trirail.config.tables import (
     BASE,
@@ -50,6 +50,7 @@ __all__ = [
     "Tls",
     "UserName",
     "Zenoh",
+    "check",
     "check_as_built",
     "check_reach",
     "corrected_geometry",
@@ -59,6 +60,7 @@ __all__ = [
     "metrics_url",
     "overlap",
     "parse",
+    "parse_values",
     "room",
     "toml_tables",
     "wrong_values",

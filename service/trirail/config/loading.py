@@ -37,9 +37,18 @@ def load(path: Path) -> Config:
 
 def parse(text: str) -> Config:
     """Parse a configuration in TOML. Raises ConfigError if it is invalid."""
+    config = parse_values(text)
+    check(config)
+    return config
+
+
+def parse_values(text: str) -> Config:
+    """Parse a configuration in TOML, but do not check its values against each other.
+
+    Raises ConfigError if it is not TOML, or if a key does not accept its value.
+    """
     config, wrong = repaired(toml_tables(text))
     _refuse(wrong)
-    check(config)
     return config
 
 
