@@ -5,19 +5,23 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import json
+import math
 import signal
 import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import calibrate
+import msgspec
 import numpy as np
 import patient
 import pytest
+import tomlkit
 import warm
 from alignment.cameras import FIELD as FIELD_PX
 from alignment.cameras import BuiltStage, wide_camera
-from hypothesis import example, given, settings
+from hypothesis import example, given, reject, settings
 from hypothesis import strategies as st
 from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.geometry_calibration import GeometryCalibration, GeometryTask, calibrate_geometry
@@ -28,11 +32,14 @@ from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.client.stage_as_built import built_otherwise
 from trirail.commissioning import config_edit
-from trirail.config import SIM, as_built, geometry, load, parse, room
-from trirail.errors import ConfigError
+from trirail.config import SIM, GeometryTable, as_built, geometry, load, parse, parse_values, room
+from trirail.errors import ConfigError, KinematicsError
+from trirail.kinematics.calibration import corrected
 from trirail.kinematics.correction import Correction
 from trirail.kinematics.geometry import LEGS
 from trirail.kinematics.robot import forward
+from trirail.processes.publications import info
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.state import State
 from trirail_drivers.driver import scaling
 from trirail_drivers.interface import Triple
@@ -194,6 +201,43 @@ def test_only_the_geometry_and_the_scales_change_in_the_file(name: str) -> None:
     assert written.limits == parse(text).limits
     comments = [line for line in text.splitlines() if line.startswith("#")]
     assert all(line in config_edit.edit_geometry(text, built, (0.0, 0.0, 0.0), None) for line in comments)
+
+
+TURNS = st.sampled_from((0.0, 0.5, 1.0, 1.5, 2.0, -1.0, -1.5, -2.0)).flatmap(
+    lambda turn: st.floats(-2.0, 2.0) | st.just(turn)
+)
+CHANGES = st.tuples(*[st.floats(-1e-3, 1e-3)] * 15)
+
+
+@pytest.mark.parametrize("name", ["uvw", "uvw-ppr"])
+@given(half_turns=st.tuples(*[TURNS] * 3), changes=CHANGES)
+@example(half_turns=(0.0, 0.0, 1.5), changes=(*[0.0] * 14, 1e-4))  # the cross slide of C is at 360° by default
+@example(half_turns=(2.0, -2.0, 1.9), changes=(1e-4, 0.0, 0.0, 0.0, 1e-4, -1e-4, 0.0, 0.0, 0.0, -1e-4, *[1e-4] * 5))
+@settings(max_examples=40)
+def test_a_geometry_with_rails_in_any_direction_is_written_and_sent(
+    name: str, half_turns: Triple, changes: tuple[float, ...]
+) -> None:
+    text = SIM.with_name(f"{name}.toml").read_text(encoding="utf-8")
+    values, tables = parse(text), tomlkit.parse(text)
+    for leg, half_turn in zip(tables["geometry"]["leg"], half_turns, strict=True):
+        leg["rail_angle"] = half_turn * math.pi
+        if "edge_angle" in leg:
+            leg["edge_angle"] = math.remainder(half_turn * math.pi + 0.5 * math.pi, math.tau)
+    text = tomlkit.dumps(tables)
+    try:
+        start = geometry(parse_values(text).geometry)
+        built = corrected(start, np.reshape(changes, (3, 5)))
+    except (ConfigError, KinematicsError):
+        reject()  # it is singular
+    sent = DrawnRobot.from_info(info(msgspec.structs.replace(values, geometry=parse_values(text).geometry)))
+    assert as_built.geometry_of(sent.geometry) == as_built.geometry_of(start)
+    written = geometry(parse_values(config_edit.edit_geometry(text, built, (0.0, 0.0, 0.0), None)).geometry)
+    assert as_built.geometry_of(written) == as_built.geometry_of(built)
+    section = geometry(msgspec.convert(tomllib.loads(calibrate.section(built))["geometry"], GeometryTable))
+    assert section == built
+    for leg, first, row in zip(built.each, start.each, np.reshape(changes, (3, 5)).tolist(), strict=True):
+        pose = np.array([1e-3]), np.array([-2e-3]), np.array([0.01])
+        assert np.array(leg.travels(*pose)) == pytest.approx(np.array(first.corrected(row).travels(*pose)), abs=1e-9)
 
 
 OFFSETS = st.one_of(st.just(0.0), st.floats(-0.5, 0.5), st.floats(-90.0, 90.0))

@@ -14,6 +14,7 @@ result names their parameters.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from trirail.errors import KinematicsError, TrirailError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import LEGS, Geometry
+from trirail.kinematics.leg import AnyLeg, wrapped
 from trirail.kinematics.robot import forward, inverse, jacobians
 
 __all__ = ["Calibration", "CalibrationError", "Open", "corrected", "identify", "pose_derivatives"]
@@ -135,9 +137,19 @@ def identify(
 
 
 def corrected(start: Geometry, corrections: Array) -> Geometry:
-    """Return a geometry with corrections (3, 5) added to its parameters [m, rad]. Raises KinematicsError if invalid."""
-    first, second, third = (leg.corrected(row) for leg, row in zip(start.each, corrections.tolist(), strict=True))
+    """Return a geometry with corrections (3, 5) added to its parameters [m, rad]. Raises KinematicsError if invalid.
+
+    Its angles are within one turn, because configurations accept no others.
+    """
+    legs = [leg.corrected(row) for leg, row in zip(start.each, corrections.tolist(), strict=True)]
+    first, second, third = (replace(leg, **_angles_beyond_a_turn(leg)) for leg in legs)
     return Geometry(legs=(first, second, third), labels=start.labels)
+
+
+def _angles_beyond_a_turn(leg: AnyLeg) -> dict[str, float]:
+    """Return the angles of a leg that are beyond ±2 pi, reduced to the range (-pi, pi]."""
+    angles = {key: value for key, value in leg.keys().items() if key.endswith("angle")}
+    return {key: wrapped(value) for key, value in angles.items() if abs(value) > 2.0 * math.pi}
 
 
 def pose_derivatives(geometry: Geometry, start: Geometry, poses: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -93,4 +94,9 @@ def _signal(kind: Literal["output", "input"], name: str, drive: str, bit: int) -
 
 
 def _leg(table: dict[str, object]) -> dict[str, object]:
-    return {name: value for name, value in table.items() if name != "name"}
+    """Return the keys of a leg in a configuration."""
+    keys = {name: value for name, value in table.items() if name != "name"}
+    angle = keys.get("slide_angle")
+    if isinstance(angle, float) and abs(angle) > 2.0 * math.pi:
+        del keys["slide_angle"]  # no configuration accepts it: it is the default for a rail_angle above 270°
+    return keys
