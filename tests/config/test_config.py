@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import Rig
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given, reject, settings
 from hypothesis import strategies as st
 from msgspec import Meta, Struct
 from msgspec.structs import fields
@@ -25,6 +25,7 @@ from trirail.config import (
     SliderLimits,
     Zenoh,
     geometry,
+    impossible,
     load,
     metrics_url,
     parse,
@@ -32,11 +33,16 @@ from trirail.config import (
 )
 from trirail.config.impossible import check
 from trirail.config.tables import LegTable
-from trirail.errors import ConfigError
+from trirail.errors import ConfigError, KinematicsError
 from trirail.kinematics.robot import forward, inverse
+from trirail.motion import paths
+from trirail.motion.backlash_reserve import planned_limits
+from trirail.motion.limits import Bounds
 from trirail.telemetry import provenance
 from trirail.wire.goals import PoseGoal
 from trirail.wire.vocabulary import Mode
+from trirail.workspace.singularity import distance_to_singularity
+from trirail.workspace.violations import violations
 from trirail_drivers.config import Can, Drive, ObjectWrite
 from trirail_drivers.errors import MAX_MESSAGE_LENGTH, BusError, DriveError
 
@@ -657,3 +663,42 @@ def test_the_pose_is_computed_right_from_the_sliders_wherever_a_platform_may_tur
     poses = np.zeros((20, 3))
     poses[:, 2] = np.linspace(*phi, len(poses))
     assert forward(robot, inverse(robot, poses).position) == pytest.approx(poses, abs=1e-7)
+
+
+def test_the_tolerance_of_poses_is_that_of_plans() -> None:
+    assert impossible.ROUNDING == paths.ROUNDING
+
+
+BEYOND = st.sampled_from((0.0, 0.5e-9, -0.5e-9)) | st.floats(2e-9, 3e-5) | st.floats(-3e-5, -2e-9)
+
+
+@pytest.mark.parametrize("name", ["sim.toml", "uvw.toml", "uvw-ppr.toml", "xxy.toml"])
+@example(axis=0, end=1, beyond=0.0, phi=0.0)
+@example(axis=0, end=0, beyond=0.0, phi=0.0)
+@example(axis=1, end=1, beyond=0.0, phi=0.0)
+@given(axis=st.integers(0, 2), end=st.integers(0, 1), beyond=BEYOND, phi=st.just(0.0) | st.floats(-0.05, 0.05))
+def test_named_poses_are_accepted_where_plans_may_end(
+    name: str, axis: int, end: int, beyond: float, phi: float
+) -> None:
+    """Slider `axis` is at an end of its travel, plus `beyond` [m], and another slider is at zero."""
+    config = load(SIM.with_name(name))
+    robot, limits = geometry(config.geometry), config.limits
+    sliders = inverse(robot, (0.0, 0.0, phi)).position
+    sliders[axis] = limits.slider.positions[axis][end] + beyond
+    try:
+        pose = forward(robot, sliders)
+        motion = inverse(robot, pose)
+    except KinematicsError:
+        reject()
+    bounds = Bounds(planned_limits(limits, config.correction.backlash), config.period)
+    rows = [motion.position, np.zeros(3), np.zeros(3), motion.passive_position]
+    of_joints = bounds.setpoint_violation(rows)
+    named = msgspec.structs.replace(config, poses={"load": tuple(pose.tolist())})
+    try:
+        check(named)
+        refused = False
+    except ConfigError as error:
+        refused = "poses.load" in str(error)
+    assert refused is (bounds.pose_violation(pose) is not None or of_joints is not None)
+    if distance_to_singularity(robot, pose) > limits.singularity_margin:
+        assert bool(violations(robot, limits, pose)) is (of_joints is not None)

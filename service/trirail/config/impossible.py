@@ -33,6 +33,8 @@ def check_as_built(errors: AsBuilt, robot: Geometry, limits: Limits) -> None:
 MAX_RANGE_SIZES = 10.0
 """Largest plausible value of a range, in multiples of the robot's size."""
 MM = FAMILIAR_UNITS["m"][0]
+ROUNDING = 1e-9
+"""Distance by which a pose may exceed a limit because of rounding [m, rad], as in plans (motion.paths.ROUNDING)."""
 _WINDOWS = (
     *((f"sliders[{i}]", "m") for i in range(3)),
     *((f"pose[{i}]", unit) for i, unit in enumerate(("m", "m", "rad"))),
@@ -256,7 +258,7 @@ def _check_pose(config: Config, name: str) -> None:
         for label, at in zip(robot.labels, passive, strict=True)
     ]
     for coordinate, at, key, (low, high) in places:
-        if not low <= at <= high:
+        if not low - ROUNDING <= at <= high + ROUNDING:
             numbers = ", ".join(f"{value:g}" for value in pose)
             raise ConfigError(
                 f"poses.{name} = [{numbers}]: {coordinate} would be {at:.6g}, outside {key} = [{low:g}, {high:g}]"

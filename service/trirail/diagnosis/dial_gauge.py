@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from trirail.config import Config, geometry
+from trirail.config.impossible import ROUNDING
 from trirail.diagnosis.check import Check, ConfigCheck
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, other_kind, travels
@@ -58,7 +59,7 @@ def _zero(config: Config) -> Iterator[Check]:
     robot = geometry(config.geometry)
     at_zero = travels(robot, (0.0, 0.0, 0.0))[0].tolist()
     for leg, at, (low, high) in zip(robot.labels, at_zero, config.limits.slider.positions, strict=True):
-        if not low <= at <= high:
+        if not low - ROUNDING <= at <= high + ROUNDING:
             finding = f"at x = y = φ = 0 slider {leg} would be at {at:.4g} m, beyond its travel, [{low:g}, {high:g}]"
             yield Check(
                 "reach",
