@@ -45,6 +45,7 @@ from trirail.workspace.singularity import distance_to_singularity
 from trirail.workspace.violations import violations
 from trirail_drivers.config import Can, Drive, ObjectWrite
 from trirail_drivers.errors import MAX_MESSAGE_LENGTH, BusError, DriveError
+from trirail_drivers.interface import Triple
 
 TEXT = SIM.read_text()
 LISTEN, TLS = 'listen = ["tcp/127.0.0.1:7447"]', 'listen = ["tls/0.0.0.0:7447"]\n[zenoh.tls]'
@@ -669,16 +670,23 @@ def test_the_tolerance_of_poses_is_that_of_plans() -> None:
     assert impossible.ROUNDING == paths.ROUNDING
 
 
+PLAYS = st.just((0.0, 0.0, 0.0)) | st.tuples(*[st.floats(0.0, 5e-5)] * 3)
 BEYOND = st.sampled_from((0.0, 0.5e-9, -0.5e-9)) | st.floats(2e-9, 3e-5) | st.floats(-3e-5, -2e-9)
 
 
 @pytest.mark.parametrize("name", ["sim.toml", "uvw.toml", "uvw-ppr.toml", "xxy.toml"])
-@example(axis=0, end=1, beyond=0.0, phi=0.0)
-@example(axis=0, end=0, beyond=0.0, phi=0.0)
-@example(axis=1, end=1, beyond=0.0, phi=0.0)
-@given(axis=st.integers(0, 2), end=st.integers(0, 1), beyond=BEYOND, phi=st.just(0.0) | st.floats(-0.05, 0.05))
+@example(axis=0, end=1, beyond=0.0, phi=0.0, backlash=(0.0, 0.0, 0.0))
+@example(axis=0, end=0, beyond=0.0, phi=0.0, backlash=(0.0, 0.0, 0.0))
+@example(axis=1, end=1, beyond=-5e-6, phi=0.0, backlash=(2e-5, 0.0, 0.0))
+@given(
+    axis=st.integers(0, 2),
+    end=st.integers(0, 1),
+    beyond=BEYOND,
+    phi=st.just(0.0) | st.floats(-0.05, 0.05),
+    backlash=PLAYS,
+)
 def test_named_poses_are_accepted_where_plans_may_end(
-    name: str, axis: int, end: int, beyond: float, phi: float
+    name: str, axis: int, end: int, beyond: float, phi: float, backlash: Triple
 ) -> None:
     """Slider `axis` is at an end of its travel, plus `beyond` [m], and another slider is at zero."""
     config = load(SIM.with_name(name))
@@ -690,15 +698,28 @@ def test_named_poses_are_accepted_where_plans_may_end(
         motion = inverse(robot, pose)
     except KinematicsError:
         reject()
-    bounds = Bounds(planned_limits(limits, config.correction.backlash), config.period)
+    bounds = Bounds(planned_limits(limits, backlash), config.period)
     rows = [motion.position, np.zeros(3), np.zeros(3), motion.passive_position]
     of_joints = bounds.setpoint_violation(rows)
-    named = msgspec.structs.replace(config, poses={"load": tuple(pose.tolist())})
+    correction = msgspec.structs.replace(config.correction, backlash=backlash)
+    named = msgspec.structs.replace(config, correction=correction, poses={"load": tuple(pose.tolist())})
     try:
         check(named)
         refused = False
     except ConfigError as error:
         refused = "poses.load" in str(error)
     assert refused is (bounds.pose_violation(pose) is not None or of_joints is not None)
-    if distance_to_singularity(robot, pose) > limits.singularity_margin:
+    if not any(backlash) and distance_to_singularity(robot, pose) > limits.singularity_margin:
         assert bool(violations(robot, limits, pose)) is (of_joints is not None)
+
+
+def test_backlash_leaves_travel_and_a_pose_in_its_reserve_is_refused_with_the_reason() -> None:
+    text = SIM.with_name("uvw-ppr.toml").read_text(encoding="utf-8")
+    narrow = text.replace("position = [-0.01, 0.01]", "position = [-0.0004, 0.0004]")
+    assert parse(f"{narrow}\n[correction]\nbacklash = [7e-4, 0.0, 0.0]\n")
+    with pytest.raises(ConfigError, match=r"correction.backlash = \[0.001, 0.0, 0.0\]: 0.001 m leaves no travel"):
+        parse(f"{narrow}\n[correction]\nbacklash = [1e-3, 0.0, 0.0]\n")
+    play = f"{text}\n[correction]\nbacklash = [2e-5, 0.0, 0.0]\n[poses]\n"
+    assert parse(f"{play}load = [0.00999, 0.0, 0.0]\n")
+    with pytest.raises(ConfigError, match=r"slider U would be 0.009995.*half of the widest correction.backlash"):
+        parse(f"{play}load = [0.009995, 0.0, 0.0]\n")

@@ -93,6 +93,7 @@ def rules(config: Config) -> Iterator[Rule]:
         if key != "limits.platform.phi":
             yield Rule(key, ("geometry",), partial(_check_metres, config, key, *both))
     yield Rule("correction.map", ("geometry", "limits"), partial(_check_correction, config))
+    yield Rule("correction.backlash", ("limits.slider.position",), partial(_check_backlash, config))
     reads = "limits.platform.x", "limits.platform.y", "limits.singularity_margin", "geometry", "correction"
     yield Rule("limits.platform.phi", reads, partial(_check_singular_angles, config))
     yield from network_rules(config)
@@ -238,9 +239,21 @@ def _check_correction(config: Config) -> None:
         raise ConfigError(f"correction.map: {table.map or 'as_built'}: {error}") from error
 
 
+def _check_backlash(config: Config) -> None:
+    """Refuse backlash that leaves no travel. Plans keep half of the widest backlash free at each end of the travel."""
+    slider, widest = config.limits.slider, max(config.correction.backlash)
+    for key, (low, high) in zip(slider.keys("position"), slider.positions, strict=True):
+        if widest >= high - low:
+            raise ConfigError(
+                f"correction.backlash = {[*config.correction.backlash]}: {widest:g} m leaves no travel of {key} = "
+                f"[{low:g}, {high:g}]; measure the backlash again, or widen the travel"
+            )
+
+
 def _check_pose(config: Config, name: str) -> None:
-    """Refuse a named pose that is outside the limits."""
+    """Refuse a named pose that is outside the limits, or closer to the end of a slider's travel than a plan may be."""
     platform, slider, pose = config.limits.platform, config.limits.slider, config.poses[name]
+    reserve = max(config.correction.backlash) / 2.0
     if is_quantity(name):
         raise ConfigError(f"poses.{name}: {name} {QUANTITY_RULE}")
     places = [
@@ -258,8 +271,10 @@ def _check_pose(config: Config, name: str) -> None:
         for label, at in zip(robot.labels, passive, strict=True)
     ]
     for coordinate, at, key, (low, high) in places:
-        if not low - ROUNDING <= at <= high + ROUNDING:
+        less = reserve if coordinate.startswith("slider") else 0.0
+        if not low + less - ROUNDING <= at <= high - less + ROUNDING:
             numbers = ", ".join(f"{value:g}" for value in pose)
+            kept = f"; half of the widest correction.backlash, {less:g} m, is kept free at each end" if less else ""
             raise ConfigError(
-                f"poses.{name} = [{numbers}]: {coordinate} would be {at:.6g}, outside {key} = [{low:g}, {high:g}]"
+                f"poses.{name} = [{numbers}]: {coordinate} would be {at:.6g}, outside {key} = [{low:g}, {high:g}]{kept}"
             )
