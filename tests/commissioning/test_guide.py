@@ -20,6 +20,7 @@ from trirail.commissioning import bench as benches
 from trirail.commissioning import opening
 from trirail.commissioning.guide import Guide
 from trirail.commissioning.judgement import Judgement
+from trirail.commissioning.observer import Observer
 from trirail.commissioning.opening import open_steps
 from trirail.commissioning.person import Question, QuitRequest
 from trirail.commissioning.report import CommissioningReport, ReportFile, StepReport
@@ -152,6 +153,24 @@ def test_drives_that_are_to_be_homed_are_homed_one_by_one(tmp_path: Path) -> Non
     assert run.keeper.report.complete, run.person.lines
     for name, way in zip(NAMES, (-0.01, -0.02, -0.03), strict=True):
         assert run.of("home", name).measured["way"] == pytest.approx(way, abs=2e-3)
+
+
+@pytest.mark.parametrize("method", [19, 37])
+def test_the_travel_of_a_homing_is_not_derived_from_an_encoder_whose_zero_moves(method: int) -> None:
+    robot = with_drives(ROBOT, homing=msgspec.structs.replace(HOMING, method=method))
+    start = msgspec.structs.replace(robot.can.simulated, start=(0.012, 0.0, 0.0))
+    robot = msgspec.structs.replace(robot, can=msgspec.structs.replace(robot.can, simulated=start))
+    person = Beside(answers={"Did slider A stop": ["y"]})
+    with open_steps(robot, [], person, lambda: False, sleep=lambda _: None) as steps:
+        steps.session.set_up()
+        rules = steps.session.environment.rules
+        assert rules is not None
+        steps._observer = Observer(person, None, steps.session.idle, NAMES)  # as with real drives
+        before = rules.read()[0]
+        judgement, measured = steps.home("A")
+        assert abs(rules.read()[0] - before) == pytest.approx(0.012 if method == 19 else 0.0, abs=2e-3)
+    assert (judgement.verdict, measured["way"]) == ("ok", None)
+    assert re.fullmatch(r"drive A reports home; slider A is at [+-]\d\.\d+ mm", judgement.words[0])
 
 
 # ---------------------------------------------------------------------- faults, found and named

@@ -80,9 +80,9 @@ def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: 
 
 
 def judge_homing(
-    drive: str, travel: float, position: float, confirmed: bool, stopped: str, labels: Labels = NAMES
+    drive: str, travel: float | None, position: float, confirmed: bool, stopped: str, labels: Labels = NAMES
 ) -> Judgement:
-    """Judge a homing that ended at `position` [m] after `travel` [m].
+    """Judge a homing that ended at `position` [m] after `travel` [m], which is None if nothing measured it.
 
     `confirmed` is True if the person confirmed that the slider is at its home switch. `stopped` is the reason why the
     drives were stopped, or "".
@@ -94,7 +94,8 @@ def judge_homing(
             (stopped,),
             f"check {slider}'s home switch, its wiring, and drives.{drive}.homing: method, speeds, timeout",
         )
-    words = (f"drive {drive} reports home; {slider} moved {format_mm(travel)} and is at {format_mm(position)}",)
+    moved = "" if travel is None else f"moved {format_mm(travel)} and "
+    words = (f"drive {drive} reports home; {slider} {moved}is at {format_mm(position)}",)
     if confirmed:
         return Judgement("ok", words)
     return Judgement(

@@ -190,7 +190,7 @@ class Steps:
         homing = self._config.drives.each[index].homing
         if homing is None:
             return Judgement("ok", ("no homing: its encoder is absolute",)), {}
-        start, stopped, rules = bench.position[index], "", self._observer.read_rules()
+        stopped, rules = "", self._observer.read_rules()
         try:
             with bench.power(name):
                 bench.home(homing.timeout)
@@ -199,7 +199,8 @@ class Steps:
             stopped = str(error)
         position = bench.position[index]
         now = self._observer.read_rules()
-        travel = position - start if rules is None or now is None else now[index] - rules[index]
+        # Homing moves the zero of the encoder, so a difference of its readings is not the travel.
+        travel = None if rules is None or now is None else now[index] - rules[index]
         confirmed = stopped or self._observer.ask_yes_no(
             f"Did slider {self.slider_label(name)} stop at its home switch?"
         )
