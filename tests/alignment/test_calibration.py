@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, calibrate, to_base_frame
 from trirail.alignment.images import LENSES, Lens, locate_pixels, project_points, projection_jacobians
 from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves, calibration_moves
-from trirail.errors import AlignmentError, AlignmentFault
+from trirail.errors import AlignmentError, AlignmentFault, RefusedError
 from trirail_drivers.interface import Triple
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -51,6 +51,20 @@ def test_exact_looks_give_the_exact_camera_and_marks(seed: int, lens: Lens, one:
     assert found.reach == pytest.approx(
         max(np.linalg.norm(to_base_frame(q, p) - np.array(q)) for q in stage.part.values() for p in MORE), rel=1e-6
     )
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_only_a_radial_lens_needs_its_centre_and_is_refused_without_it_before_a_look(lens: Lens) -> None:
+    stage = one_camera(1, lens)
+    views = dict.fromkeys(stage.part, "camera")
+    samples = [CalibrationSample(pose, stage.look()) for pose in MORE]
+    if lens != "radial":
+        assert stage.drive(calibrate_by_moves(MORE, views, lens)).noise < 1e-6
+        return
+    with pytest.raises(RefusedError, match=r"centre is None: expected the pixel \(u, v\) on the axis"):
+        next(calibrate_by_moves(MORE, views, lens))
+    with pytest.raises(RefusedError, match="centre is None"):
+        calibrate(samples, views, lens)
 
 
 @given(SEEDS, st.sampled_from(LENSES))

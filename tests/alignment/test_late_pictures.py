@@ -137,7 +137,7 @@ BAD_CALIBRATIONS = {
     "moves": (3, "abc", [(1e-3, 0.0)], [(math.nan, 0.0, 0.0)], [None], *((m, "x") for m in DEFAULT_MOVES[:1])),
     "views": ([1], {"left": 3}, {"left": "one"}),
     "lens": ("fisheye", None, 3),
-    "centre": (None, (1.0,), (math.nan, 0.0)),
+    "centre": ((1.0,), (math.nan, 0.0)),
     "looks": BAD_TASKS["looks"],
     "approach": BAD_TASKS["approach"],
 }

@@ -110,6 +110,8 @@ def test_what_look_raises_ends_it_and_a_correction_out_of_reach_is_refused(locat
         robot.move_to(x=0.0, y=0.0, phi=0.0).wait(60.0)
         calibration = robot.calibrate_camera(lambda: seen(PART, robot.state().pose))
         targets = seen(PART, (0.0, 0.0, 0.0))
+        with pytest.raises(RefusedError, match="centre is None"):
+            robot.calibrate_camera(lambda: seen(PART, robot.state().pose), lens="radial")
         with pytest.raises(ZeroDivisionError):
             robot.align(lambda: 1 / 0, targets, calibration)  # type: ignore[arg-type, return-value]
         with pytest.raises(AlignmentError) as refused:

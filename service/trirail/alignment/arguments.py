@@ -75,9 +75,16 @@ def check_views(value: object) -> None:
 
 
 def check_lens(lens: object, centre: object) -> None:
-    """Raise RefusedError unless `lens` is one of LENSES and `centre` is a pixel (u, v), or one for each view."""
+    """Raise RefusedError unless `lens` is one of LENSES and `centre` is a pixel (u, v), or one for each view.
+
+    `centre` may be None, except for a radial lens: with a wrong centre, the fit succeeds, but its positions are wrong.
+    """
     if lens not in LENSES:
         _refuse(lens, "lens", f"one of {', '.join(LENSES)}")
+    if centre is None:
+        if lens == "radial":
+            _refuse(None, "centre", "the pixel (u, v) on the axis of the radial lens, usually the picture's centre")
+        return
     for each in centre.values() if isinstance(centre, Mapping) else (centre,):
         if parse_pixel(each) is None:
             _refuse(each, "centre", "two finite pixels (u, v)")

@@ -43,7 +43,7 @@ def calibrate_by_moves(
     moves: Sequence[Triple] = DEFAULT_MOVES,
     views: Mapping[str, str] | None = None,
     lens: Lens = "affine",
-    centre: Pair | Mapping[str, Pair] = (0.0, 0.0),
+    centre: Pair | Mapping[str, Pair] | None = None,
     looks: int = 1,
     approach: Triple | None = None,
 ) -> Generator[AlignmentRequest, Observation, CameraCalibration]:

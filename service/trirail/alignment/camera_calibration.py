@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from trirail_drivers.interface import Triple
 
+from trirail.alignment.arguments import check_lens
 from trirail.alignment.images import CameraView, Lens, Pair, Points, project_points, project_with
 from trirail.alignment.rigid_motion import Floats, rotation_matrix
 from trirail.errors import AlignmentError, AlignmentFault
@@ -99,7 +100,7 @@ def calibrate(
     samples: Sequence[CalibrationSample],
     views: Mapping[str, str] | None = None,
     lens: Lens = "affine",
-    centre: Pair | Mapping[str, Pair] = (0.0, 0.0),
+    centre: Pair | Mapping[str, Pair] | None = None,
     looks: int = 1,
 ) -> CameraCalibration:
     """Compute the calibration from the marks that were observed at several poses.
@@ -114,7 +115,7 @@ def calibrate(
     lens
         Kind of the lens of all views.
     centre
-        Pixel on the axis of a radial lens, for all views or for each view by its name.
+        Pixel on the axis of a radial lens, for all views or for each view by its name. Other lenses do not use it.
     looks
         Number of pictures that were averaged in each sample.
 
@@ -123,7 +124,10 @@ def calibrate(
     AlignmentError
         There are too few samples, the marks do not follow the moves, the moves do not determine all unknowns, or two
         marks are swapped in one sample.
+    RefusedError
+        The lens is unknown, or it is radial and there is no centre.
     """
+    check_lens(lens, centre)
     failure, noise = None, math.inf
     try:
         calibration = fit_cameras(samples, views, lens, centre, looks)
@@ -162,10 +166,11 @@ def fit_cameras(
     samples: Sequence[CalibrationSample],
     views: Mapping[str, str] | None = None,
     lens: Lens = "affine",
-    centre: Pair | Mapping[str, Pair] = (0.0, 0.0),
+    centre: Pair | Mapping[str, Pair] | None = None,
     looks: int = 1,
 ) -> CameraCalibration:
     """Fit the calibration to the marks, and do not look for swapped marks. Parameters are those of `calibrate`."""
+    centre = (0.0, 0.0) if centre is None else centre
     names = sorted({name for sample in samples for name in sample.marks})
     view_of = dict(views) if views is not None else {name: name for name in names}
     if unknown := [name for name in names if name not in view_of]:
@@ -179,7 +184,11 @@ def fit_cameras(
             samples,
             [name for name in names if view_of[name] == view],
             CameraView(
-                (0, 0), (0, 0), ((1, 0), (0, 1)), lens, centre=centre[view] if isinstance(centre, Mapping) else centre
+                (0, 0),
+                (0, 0),
+                ((1, 0), (0, 1)),
+                lens,
+                centre=centre[view] if isinstance(centre, Mapping) else centre,
             ),
             view,
         )

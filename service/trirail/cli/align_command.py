@@ -76,7 +76,7 @@ def calibrate(
     moves = calibration_moves(lens, by, notation.radians(angle, False))
     with source.open_source() as (look, known), service.open() as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known
-        requests = calibrate_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
+        requests = calibrate_by_moves(moves, views, lens, centre, source.looks, _approach(approach))
         calibration = drive(robot, look, _with_progress(requests, service, len(moves) + 1), source.speed, source.wait)
         targets = dict(drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks)
         made_with = geometry_id(robot.info())

@@ -397,7 +397,7 @@ class AsyncRobot:
         *,
         views: Mapping[str, str] | None = None,
         lens: Lens = "affine",
-        centre: tuple[float, float] = (0.0, 0.0),
+        centre: tuple[float, float] | None = None,
         looks: int = 1,
         approach: Triple | None = None,
         speed: float = 1.0,
