@@ -15,7 +15,7 @@ import msgspec
 import trirail_drivers
 from trirail_drivers.interface import NAMES
 
-from trirail.config import Config, parse
+from trirail.config import Config, parse_values
 from trirail.errors import ConfigError
 from trirail.naming import Labels
 from trirail.wire.decoding import INVALID, decoded, prepare
@@ -61,9 +61,12 @@ def text_documents(config: Config) -> dict[str, str]:
 
 
 def configuration(documents: Mapping[str, str]) -> Config | None:
-    """Return the configuration stored in a recording; None if it has none. Raises ConfigError if it is invalid."""
+    """Return the configuration stored in a recording; None if it has none. Raises ConfigError if it is invalid.
+
+    Its values are not checked against each other: an earlier version may have accepted what this version refuses.
+    """
     text = documents.get(CONFIGURATION)
-    return parse(text) if text is not None else None
+    return parse_values(text) if text is not None else None
 
 
 def labels(documents: Mapping[str, str]) -> Labels:
