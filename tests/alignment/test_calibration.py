@@ -140,6 +140,45 @@ def test_a_mark_that_is_missing_in_a_look_is_missed_in_none_of_the_others() -> N
     assert "left" not in found.residuals[3]
 
 
+PLACES = {"a": (0.0, 0.0), "b": (0.0021, -0.0007), "c": (0.001, 0.0012)}
+"""Mark a is at the centre of the rotations."""
+
+
+def shared_camera(
+    seed: int, hidden: set[tuple[str, int]], noise: float = 0.1, jitter: float = 0.0
+) -> CameraCalibration:
+    """Calibrate one camera with the looks of DEFAULT_MOVES; `hidden` are marks and looks, counted from 1."""
+    rng = np.random.default_rng(seed)
+    view, samples = camera(rng, (0.02, 0.01)), []
+    for n, move in enumerate(((0.0, 0.0, 0.0), *DEFAULT_MOVES), 1):
+        x, y, phi = (np.array(move) + jitter * rng.standard_normal(3)).tolist()
+        seen = {
+            name: project_points(view, to_base_frame(q, (x, y, phi))[None])[0] + 0.1 * rng.standard_normal(2)
+            for name, q in PLACES.items()
+            if (name, n) not in hidden
+        }
+        samples.append(CalibrationSample((x, y, phi), {name: (u, v) for name, (u, v) in seen.items()}))
+    return calibrate(samples, dict.fromkeys(PLACES, "cam"))
+
+
+@given(seed=SEEDS, name=st.sampled_from("abc"), others=st.sets(st.integers(2, 5)), jitter=st.sampled_from((0.0, 1e-8)))
+def test_a_mark_that_is_hidden_at_every_rotation_is_named(
+    seed: int, name: str, others: set[int], jitter: float
+) -> None:
+    with pytest.raises(AlignmentError) as refused:
+        shared_camera(seed, {(name, look) for look in (*others, 6, 7)}, jitter=jitter)
+    assert refused.value.fault is AlignmentFault.MISSING
+    looks = ", ".join(map(str, sorted((*others, 6, 7))))
+    assert f"view cam: mark {name} was not found in look {looks}, and" in str(refused.value)
+
+
+@given(SEEDS)
+def test_a_mark_that_moves_little_in_the_looks_that_show_it_does_not_fail_the_others(seed: int) -> None:
+    found = shared_camera(seed, {("a", look) for look in (2, 3, 4, 5)})
+    assert found.noise < 0.5
+    assert found.marks["a"].place == pytest.approx(PLACES["a"], abs=1e-4)
+
+
 @given(SEEDS, st.sampled_from(LENSES), st.booleans(), st.booleans(), st.integers(0, 2**31))
 def test_marks_that_are_swapped_in_one_look_are_refused(
     seed: int, lens: Lens, one: bool, many: bool, look: int

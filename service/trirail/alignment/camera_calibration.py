@@ -36,6 +36,8 @@ SUSPICIOUS_NOISE_PX = 1.0
 """Noise above which marks may be swapped in a sample [pixel]. Marks are located with a noise of about 0.1 pixel."""
 MAX_SWAP_NOISE_SHARE = 0.1
 """Two marks count as swapped if exchanging them reduces the noise to this fraction or less."""
+MIN_TURN_SHARE = 0.01
+"""Least share of the rotation of all looks over which a mark must have been found, so that its position is known."""
 MAX_CONDITION = 1e6
 """Condition number of the scaled Jacobian above which the moves do not determine all unknowns."""
 
@@ -226,6 +228,9 @@ class _ViewFit:
 
     def __init__(self, samples: Sequence[CalibrationSample], names: Sequence[str], lens: CameraView, view: str) -> None:
         self.names, self._lens, self._name = names, lens, view
+        self._poses = np.array([sample.pose for sample in samples])
+        looks = {name: [n for n, each in enumerate(samples, 1) if name not in each.marks] for name in names}
+        self._hidden = {name: missing for name, missing in looks.items() if missing}
         bends = {"affine": 0, "perspective": 2, "radial": 1}[lens.lens]
         self.first_place = 6 + bends
         rows = [
@@ -261,27 +266,33 @@ class _ViewFit:
         self.view = CameraView(origin, _pair(x[:2]), matrix, lens.lens, _pair(bend), lens.centre)
 
     def _check_samples(self) -> None:
+        turn = np.ptp(self._poses[:, 2])
+        for n, name in enumerate(self.names):
+            if name in self._hidden and np.ptp(self._phi[self._mark_index == n]) < MIN_TURN_SHARE * turn:
+                self._refuse_hidden([name])
         if self.freedom < 1:
+            if self._hidden and len(self._poses) > 1 + self.first_place / (2 * len(self.names)):
+                self._refuse_hidden([*self._hidden])
             needed = -(-(self.first_place + 2 * len(self.names) + 1) // (2 * len(self.names)))
             raise AlignmentError(
                 AlignmentFault.MOVES,
                 f"view {self._name}: {len(self._seen)} marks found over all looks, each mark needs {needed} looks; "
                 "add moves",
             )
-        spread = max(np.ptp(self._seen[self._mark_index == n], axis=0).max() for n in range(len(self.names)))
+        spread = self._spread()
         if spread < MIN_TRAVEL_PX:
             raise AlignmentError(
                 AlignmentFault.STILL,
                 f"view {self._name}: the marks moved by {spread:.2f} pixels over all moves, at least "
                 f"{MIN_TRAVEL_PX:.0f} are needed; check that the camera shows this stage, and take a new picture at "
                 "each look",
-                value=float(spread),
+                value=spread,
                 limit=MIN_TRAVEL_PX,
             )
 
     def _check_residual(self) -> None:
         residual = math.sqrt(self.squares / self.freedom)
-        spread = float(np.ptp(self._seen[self._mark_index == 0], axis=0).max())
+        spread = self._spread()
         if residual > MAX_RESIDUAL_SHARE * spread:
             raise AlignmentError(
                 AlignmentFault.STILL,
@@ -291,7 +302,28 @@ class _ViewFit:
                 limit=MAX_RESIDUAL_SHARE * spread,
             )
 
+    def _spread(self) -> float:
+        """Return the greatest travel of a mark over all looks [pixel]."""
+        return max(float(np.ptp(self._seen[self._mark_index == n], axis=0).max()) for n in range(len(self.names)))
+
+    def _refuse_hidden(self, names: Sequence[str]) -> None:
+        """Refuse marks that were not found in all looks."""
+        marks = "; ".join(
+            f"mark {name} was not found in look {', '.join(map(str, self._hidden[name]))}" for name in names
+        )
+        raise AlignmentError(
+            AlignmentFault.MISSING,
+            f"view {self._name}: {marks}, and the other looks do not determine its position; keep it in the picture at "
+            "every move, by smaller moves if necessary, or check light and focus",
+        )
+
     def _refuse_moves(self) -> None:
+        """Refuse the looks: because of hidden marks if the moves determine an affine map, else because of the moves."""
+        x, y, phi = (self._poses - self._poses[0]).T
+        design = np.stack([x, y, np.sin(phi), np.ones_like(x)], axis=1)
+        scales = np.maximum(np.abs(design).max(axis=0), 1e-300)
+        if self._hidden and np.linalg.matrix_rank(design / scales, tol=1e-6) == len(scales):
+            self._refuse_hidden([*self._hidden])
         raise AlignmentError(
             AlignmentFault.MOVES,
             f"view {self._name}: the moves do not determine its map; move along x, along y and turn, each both ways",
