@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import math
@@ -23,14 +24,16 @@ from trirail import config
 from trirail.analysis import mcap
 from trirail.analysis.urdf import document
 from trirail.cli import recording_commands
-from trirail.config import SIM, load
+from trirail.config import SIM, as_built, load
 from trirail.errors import ServiceError, TrirailError
+from trirail.kinematics.correction import Correction
 from trirail.kinematics.robot import inverse
-from trirail.telemetry import journal
+from trirail.telemetry import journal, provenance
 from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.recording import Recording
 from trirail.wire.messages import Event, FaultDetail
+from trirail.wire.records import DTYPE
 
 SHIPPED = sorted(path for path in SIM.parent.glob("*.toml"))
 FAULT = Event("fault", "error", "drive B: EMCY 8611h", seq=1, t=0.4, cycle=400, time=0.0,
@@ -114,6 +117,45 @@ def test_velocities_are_those_of_the_positions(recording: Recording) -> None:
     positions, velocities = mcap.joint_motion(records, config.geometry(settings.geometry))
     slopes = np.gradient(positions, 1.0 / made.RATE_HZ, axis=0)
     np.testing.assert_allclose(velocities[1:-1], slopes[1:-1], atol=1e-4)
+
+
+@pytest.mark.generated(*range(4))
+@pytest.mark.parametrize("name", ["sim", "uvw", "uvw-ppr", "xxy"])
+def test_the_legs_of_a_robot_with_a_map_meet_in_every_record(name: str, seed: int) -> None:
+    settings, rng = load(SIM.with_name(f"{name}.toml")), np.random.default_rng(seed)
+    geometry, platform = config.geometry(settings.geometry), settings.limits.platform
+    low, high = np.transpose([platform.x, platform.y, platform.phi])
+    nodes = rng.uniform(-1.0, 1.0, (4, 4, 4, 3)) * (1e-4, 1e-4, 1e-3)
+    corrected = dataclasses.replace(geometry, correction=Correction(tuple(low), tuple(high), nodes))
+    path = np.linspace(0.1, -0.2, 200)[:, None] * np.where(rng.uniform(size=3) > 0.5, high, low)
+    step = 1.0 / made.RATE_HZ
+    motion = inverse(corrected, path, np.gradient(path, step, axis=0))
+    records = np.zeros(len(path), DTYPE)
+    records["pose"], records["position"], records["velocity"] = path, motion.position, motion.velocity
+    positions, velocities = mcap.joint_motion(records, corrected)
+    np.testing.assert_allclose(positions[:, 6:], motion.passive_position, atol=1e-9)
+    np.testing.assert_allclose(velocities[1:-1], np.gradient(positions, step, axis=0)[1:-1], atol=1e-4)
+    robot = yourdfpy.URDF.load(io.StringIO(document("robot", geometry, settings.limits)), load_meshes=False)
+    for joints in positions[::50]:
+        robot.update_cfg(dict(zip(mcap.JOINTS, joints, strict=True)))
+        platforms = [robot.get_transform(link, "base") for link in ("platform", "centre_b", "centre_c")]
+        np.testing.assert_allclose(platforms[1:], [platforms[0]] * 2, atol=1e-9)
+
+
+def test_a_map_in_the_recorded_configuration_is_used(recording: Recording, tmp_path: Path) -> None:
+    plain = load(SIM)
+    platform = plain.limits.platform
+    nodes = np.full((4, 4, 4, 3), (1e-3, -5e-4, 0.0))
+    low, high = np.transpose([platform.x, platform.y, platform.phi]).tolist()
+    errors = as_built.measured_today(Correction(low, high, nodes), config.geometry(plain.geometry))
+    changed = msgspec.structs.replace(plain, correction=msgspec.structs.replace(plain.correction, as_built=errors))
+    text = provenance.toml(changed)
+    found = recording._replace(texts={**recording.texts, provenance.CONFIGURATION: text})
+    mcap.write(found, tmp_path / "map.mcap")
+    joints = [message.position for _, message in by_mcap(tmp_path / "map.mcap")["/joint_states"]]
+    geometry = config.corrected_geometry(changed)
+    np.testing.assert_array_equal(joints, mcap.joint_motion(recording.records, geometry)[0])
+    assert np.abs(joints - mcap.joint_motion(recording.records, config.geometry(plain.geometry))[0]).max() > 1e-4
 
 
 def test_a_file_is_never_written_over(recording: Recording, tmp_path: Path) -> None:

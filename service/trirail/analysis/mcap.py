@@ -5,6 +5,7 @@ This module needs the package rosbags.
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 import tempfile
 from collections.abc import Iterator
@@ -68,7 +69,7 @@ def write(recording: Recording, path: Path) -> int:
     settings = provenance.configuration(recording.texts)
     if settings is None:
         raise ServiceError(f"{recording.name}: MCAP needs the configuration, which this recording does not contain")
-    geometry = config.geometry(settings.geometry)
+    geometry = config.corrected_geometry(settings)
     with new_file(path), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-") as folder:
         count = _write_bag(Path(folder, "bag"), messages(recording, geometry))
         Path(folder, "bag/bag.mcap").replace(path)
@@ -90,8 +91,14 @@ def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray
     """Return the positions [m, rad] and the velocities [m/s, rad/s] of all JOINTS, each (N, 9).
 
     The values of the sliders are measured. The values of the passive joints are calculated from the measured pose.
+
+    With a correction map, the legs lead to the corrected pose. The URDF has no map, so its legs meet only if the
+    passive joints are those of this pose.
     """
     sliders, velocity, pose = records["position"] - records["backlash"], records["velocity"], records["pose"]
+    if geometry.correction is not None:
+        pose = pose + geometry.correction.at(pose)
+        geometry = dataclasses.replace(geometry, correction=None)
     J1, J2 = jacobians(geometry, pose)
     twist = np.linalg.solve(J2, J1 @ velocity[:, :, np.newaxis])[:, :, 0]
     passive = inverse(geometry, pose, twist)
