@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from trirail_drivers.interface import NAMES
+from trirail_drivers.interface import NAMES, Triple
 
 from trirail.naming import Labels
 from trirail.telemetry import provenance
@@ -108,8 +108,11 @@ class Summary(msgspec.Struct, frozen=True):
     """Configured labels of the sliders A, B, C."""
     modes: dict[str, float]
     """Time spent in each mode that occurred [s]."""
-    distance: tuple[float, float, float]
-    """Distance travelled by each slider [m]."""
+    distance: Triple
+    """Distance over which each slider was commanded to move while the drives were enabled [m].
+
+    Measured positions also change by single counts of the encoders, by homing, which sets their zero, and by hand.
+    """
     tracking: list[Tracking]
     lateness_us: Percentiles
     cycle_us: Percentiles
@@ -139,7 +142,7 @@ def summarise(recording: Recording) -> Summary:
         software=str(software) if software else UNKNOWN_LABEL,
         labels=provenance.labels(recording.texts),
         modes={str(MODES[mode]): float(count * period) for mode, count in zip(modes, counts, strict=True)},
-        distance=tuple(np.abs(np.diff(records["position"], axis=0)).sum(axis=0).tolist()),
+        distance=_distance(records),
         tracking=list(_tracking(records)),
         lateness_us=_percentiles(records["lateness_ns"]),
         cycle_us=_percentiles(records["parts_ns"].sum(axis=1)),
@@ -158,6 +161,13 @@ def summarise(recording: Recording) -> Summary:
 def _period(recording: Recording) -> float:
     steps = np.diff(recording.t)
     return float(np.median(steps)) if len(steps) else 1e-3
+
+
+def _distance(records: NDArray[np.void]) -> Triple:
+    enabled = np.isin(records["mode"], ENABLED_MODES)
+    steps = np.abs(np.diff(records["commanded_position"] - records["backlash"], axis=0))
+    a, b, c = steps[enabled[1:] & enabled[:-1]].sum(axis=0).tolist()
+    return a, b, c
 
 
 def _tracking(records: NDArray[np.void]) -> Iterator[Tracking]:

@@ -1,0 +1,55 @@
+"""Summary of a session: its numbers are those of the robot, not those of noise or of missing records."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from trirail.analysis.summary import summarise
+from trirail.telemetry.recording import Recording
+from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import MODES, Mode
+
+PERIOD = 1e-3
+COUNT = 1e-7
+"""One count of an encoder [m]."""
+SESSION = (
+    (Mode.DISABLED, 40, 0.3),
+    (Mode.ENABLING, 10, 0.0),
+    (Mode.HOMING, 60, 0.2),
+    (Mode.HOLDING, 50, 0.0),
+    (Mode.MOVING, 300, 0.05),
+    (Mode.STOPPING, 20, 0.001),
+    (Mode.HOLDING, 200, 0.0),
+    (Mode.DISABLED, 30, 0.1),
+)
+"""Modes with their cycles and the travel of every slider [m]. Without power, somebody pushes the sliders."""
+
+
+def session(seed: int) -> NDArray[np.void]:
+    """Return records of SESSION. The encoders flicker by a count, and the homing sets their zero."""
+    random, position, parts = np.random.default_rng(seed), 0.0, []
+    for mode, cycles, travel in SESSION:
+        part = np.zeros(cycles, DTYPE)
+        part["mode"] = MODES.index(mode)
+        part["commanded_position"] = np.linspace(position, position + travel, cycles)[:, None]
+        position = 0.0 if mode is Mode.HOMING else position + travel
+        parts.append(part)
+    records = np.concatenate(parts)
+    records["cycle"] = np.arange(7, 7 + len(records))
+    records["backlash"] = 1e-5 * np.sign(np.arange(len(records)) % 100 - 50.5)[:, None]
+    records["commanded_position"] += records["backlash"]
+    records["position"] = records["commanded_position"] + COUNT * random.integers(0, 2, (len(records), 3))
+    return records
+
+
+def recorded(records: NDArray[np.void]) -> Recording:
+    wall = np.datetime64("2026-01-01", "ns") + (records["cycle"] * 1_000_000).astype("timedelta64[ns]")
+    return Recording("session", records, records["cycle"] * PERIOD, wall, [], {})
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_travel_is_that_of_motions_and_not_of_noise_homing_or_hands(seed: int) -> None:
+    assert summarise(recorded(session(seed))).distance == pytest.approx((0.051,) * 3, abs=1e-9)
