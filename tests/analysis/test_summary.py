@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.analysis.summary import summarise
+from trirail.cli import recording_commands
 from trirail.telemetry.recording import Recording
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, Mode
@@ -53,3 +54,22 @@ def recorded(records: NDArray[np.void]) -> Recording:
 @given(st.integers(0, 2**32 - 1))
 def test_the_travel_is_that_of_motions_and_not_of_noise_homing_or_hands(seed: int) -> None:
     assert summarise(recorded(session(seed))).distance == pytest.approx((0.051,) * 3, abs=1e-9)
+
+
+@given(lost=st.sets(st.integers(1, 708)), seed=st.integers(0, 9))
+def test_times_in_modes_and_without_records_add_up_to_the_duration(lost: set[int], seed: int) -> None:
+    whole = session(seed)
+    kept = np.delete(whole, sorted(lost))
+    full, summed = summarise(recorded(whole)), summarise(recorded(kept))
+    assert summed.duration == full.duration
+    assert sum(summed.modes.values()) + summed.unrecorded == pytest.approx(full.duration + PERIOD)
+    assert summed.unrecorded == pytest.approx(len(lost) * PERIOD)
+    assert all(summed.modes[mode] <= full.modes[mode] + 1e-9 for mode in summed.modes)
+
+
+def test_a_report_shows_the_time_without_records(capsys: pytest.CaptureFixture[str]) -> None:
+    records = session(0)
+    recording_commands._print_summary(summarise(recorded(records)))
+    assert "not recorded" not in capsys.readouterr().out
+    recording_commands._print_summary(summarise(recorded(np.delete(records, np.arange(150, 450)))))
+    assert "not recorded 0.3 s" in " ".join(capsys.readouterr().out.split())

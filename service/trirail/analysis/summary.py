@@ -107,7 +107,9 @@ class Summary(msgspec.Struct, frozen=True):
     labels: Labels
     """Configured labels of the sliders A, B, C."""
     modes: dict[str, float]
-    """Time spent in each mode that occurred [s]."""
+    """Recorded time in each mode that occurred [s]."""
+    unrecorded: float
+    """Time in the cycles that have no record, in which the mode is unknown [s]."""
     distance: Triple
     """Distance over which each slider was commanded to move while the drives were enabled [m].
 
@@ -129,6 +131,7 @@ def summarise(recording: Recording) -> Summary:
     records = recording.records
     period = _period(recording)
     cycles = records["cycle"]
+    lacking = int(cycles[-1] - cycles[0]) + 1 - len(records)
     software = provenance.recorded_by(recording.texts)
     modes, counts = np.unique(records["mode"], return_counts=True)
     return Summary(
@@ -136,12 +139,13 @@ def summarise(recording: Recording) -> Summary:
         began=_iso(recording.wall[0]),
         duration=float(recording.t[-1] - recording.t[0]),
         cycles=len(records),
-        lacking=int(cycles[-1] - cycles[0]) + 1 - len(records),
+        lacking=lacking,
         missed=int(records["overruns"][-1] - records["overruns"][0]),
         rate_hz=round(1.0 / period),
         software=str(software) if software else UNKNOWN_LABEL,
         labels=provenance.labels(recording.texts),
         modes={str(MODES[mode]): float(count * period) for mode, count in zip(modes, counts, strict=True)},
+        unrecorded=lacking * period,
         distance=_distance(records),
         tracking=list(_tracking(records)),
         lateness_us=_percentiles(records["lateness_ns"]),

@@ -251,7 +251,8 @@ def _print_summary(summed: Summary) -> None:
     lines = _Lines()
     lines.add("session", f"[bold]{terminal.plain(summed.name)}[/], {summed.began}")
     lines.add("recorded by", terminal.plain(summed.software))
-    modes = ", ".join(f"{name} {_seconds(time)}" for name, time in summed.modes.items())
+    times = summed.modes | ({"not recorded": summed.unrecorded} if summed.lacking else {})
+    modes = ", ".join(f"{name} {_seconds(time)}" for name, time in times.items())
     lines.add("duration", f"{_seconds(summed.duration)}: {modes}")
     lines.add("moved", _each(summed.labels, summed.distance, 1.0, "m", 3))
     missed = f"[yellow]{summed.missed} missed[/]" if summed.missed else "none missed"
