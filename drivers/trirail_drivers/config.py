@@ -238,8 +238,8 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     """
     following_error: Distance = 0.005
     """Window of the following error [m] that the drives monitor, object 6065h; for ODrives, the driver monitors it. The
-    window must be wider than `[limits.slider] following_error`, so that the service stops all three drives before a
-    drive reports a fault.
+    window should be wider than `[limits.slider] following_error`, so that the service stops all three drives before a
+    drive reports a fault; `trirail doctor` warns otherwise.
     """
     quick_stop_deceleration: Acceleration = 10.0
     """Deceleration of the quick-stop ramp [m/s²], object 6085h; for ODrives, the driver generates the ramp."""

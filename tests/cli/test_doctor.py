@@ -139,6 +139,13 @@ def test_the_queue_takes_two_cycles_of_the_protocol(protocol: str, verdict: str)
     assert [check.verdict for check in checks if check.name == "can0 queue"] == [verdict]
 
 
+@pytest.mark.parametrize(("window", "bad_ones"), [(0.002, 1), (0.0015, 1), (0.0021, 0)])
+def test_the_drives_window_is_to_be_behind_the_services(window: float, bad_ones: int) -> None:
+    """REAL has limits.slider.following_error = 0.002."""
+    found = bad(doctor.examine(changed(REAL, "drives", following_error=window), GOOD))
+    assert [(each.name, each.verdict) for each in found.values()] == [("following error", "warning")] * bad_ones
+
+
 @pytest.mark.parametrize(
     ("was", "now", "read"),
     [

@@ -725,26 +725,10 @@ def test_backlash_leaves_travel_and_a_pose_in_its_reserve_is_refused_with_the_re
         parse(f"{play}load = [0.009995, 0.0, 0.0]\n")
 
 
-@example(ours=0.004, theirs=0.004)
-@example(ours=0.004, theirs=0.0041)
-@given(ours=st.floats(1e-3, 0.1), theirs=st.floats(1e-3, 0.1))
-def test_the_window_of_the_drives_is_wider_than_that_of_the_service(ours: float, theirs: float) -> None:
-    config = load(SIM)
-    slider = msgspec.structs.replace(config.limits.slider, following_error=ours)
-    limits = msgspec.structs.replace(config.limits, slider=slider)
-    drives = msgspec.structs.replace(config.drives, following_error=theirs)
-    changed = msgspec.structs.replace(config, limits=limits, drives=drives)
-    if theirs > ours:
-        check(changed)
-        return
-    with pytest.raises(ConfigError, match=r"drives.following_error = .*: it must be above limits.slider.following_err"):
-        check(changed)
-
-
 def test_a_recording_of_an_earlier_version_is_read_although_its_configuration_would_be_refused_now() -> None:
-    text = TEXT.replace("following_error = 0.005", "following_error = 0.004")
-    with pytest.raises(ConfigError):
+    text = f"{TEXT}\n[poses]\nfar = [9.0, 0.0, 0.0]\n"
+    with pytest.raises(ConfigError, match="poses.far"):
         parse(text)
     recorded = provenance.configuration({provenance.CONFIGURATION: text})
     assert recorded is not None
-    assert recorded.drives.following_error == 0.004
+    assert recorded.poses["far"] == (9.0, 0.0, 0.0)

@@ -106,8 +106,6 @@ def rules(config: Config) -> Iterator[Rule]:
     yield from settings_checks.io_rules(config.drives.protocol, named_io(config.outputs, config.inputs))
     yield from digital_rules(config.outputs, config.inputs)
     yield Rule("loop.rate_hz", (), partial(_check_rate, config))
-    following = "drives.following_error", ("limits.slider.following_error",)
-    yield Rule(*following, partial(_check_following_error, config))
     yield from settings_checks.bus_rules(config.can, config.drives.protocol)
     yield from settings_checks.rules(config.drives, _required(config))
 
@@ -199,16 +197,6 @@ def _check_rate(config: Config) -> None:
         raise ConfigError(
             f"loop.rate_hz = {config.loop.rate_hz}: a cycle must be a whole number of microseconds, "
             "for example 100, 200, 250, 400, 500, 800 or 1000"
-        )
-
-
-def _check_following_error(config: Config) -> None:
-    """Refuse windows of the drives in which a drive stops alone before the service stops all three."""
-    ours, theirs = config.limits.slider.following_error, config.drives.following_error
-    if theirs <= ours:
-        raise ConfigError(
-            f"drives.following_error = {theirs:g}: it must be above limits.slider.following_error = {ours:g}, so that "
-            "the service stops all three drives before a drive stops alone"
         )
 
 

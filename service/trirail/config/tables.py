@@ -133,7 +133,7 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     jerk: EachJerk
     """Maximum jerk of each slider [m/s³]."""
     following_error: Distance
-    """Following error above which all drives stop [m]. It must be less than `[drives] following_error`."""
+    """Following error above which all drives stop [m]. It should be less than `[drives] following_error`."""
 
     def __post_init__(self) -> None:
         pairs = sum(isinstance(each, tuple) for each in self.position)

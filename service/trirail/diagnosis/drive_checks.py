@@ -88,6 +88,19 @@ def protections(config: Config) -> Iterator[Check]:
         yield Check("protections", "ok", "no drive may lack a protection")
 
 
+def windows(config: Config) -> Iterator[Check]:
+    """Check that the service detects a following error before the drive detects it.
+
+    The service then stops all three drives. A drive would stop only itself.
+    """
+    ours, theirs = config.limits.slider.following_error, config.drives.following_error
+    if theirs > ours:
+        return
+    finding = f"drives.following_error = {theirs:g} m is not more than limits.slider.following_error, {ours:g} m"
+    remedy = f"set it above {ours:g}: else a drive faults before the service stops all three"
+    yield Check("following error", "warning", finding, remedy, "drives.following_error")
+
+
 class BusUse(Struct, frozen=True):
     """Use of the bus by the cycle, in the worst case, in a form for programs."""
 
@@ -182,5 +195,6 @@ CONFIG_CHECKS = (
     ConfigCheck(_each(*_NUMBERS, *_UNITS), _alike),
     ConfigCheck((*_each("offset", "homing"), "limits.slider", "drives.quick_stop_deceleration", "geometry"), _zero),
     ConfigCheck(("drives.protocol", *_each("accept_without")), protections),
+    ConfigCheck(("limits.slider.following_error", "drives.following_error"), windows),
     ConfigCheck(("loop.rate_hz", *_BUS, "drives.protocol", "drives.heartbeat", "drives.velocity_offset"), load),
 )
