@@ -214,6 +214,11 @@ class RefusalCode(StrEnum):
     EXPIRED = "expired", "the goal could not start in time", "send the goal again, or with a longer valid_for"
     QUEUE_FULL = "queue_full", "the goal queue is full", "send the goal when another goal has ended"
     BUSY = "busy", "too many messages, goals or commands are waiting", "send fewer, or more slowly"
+    NAME_IN_USE = (
+        "name_in_use",
+        "another service in the Zenoh network has the same robot name, so the request would reach both robots",
+        "give each robot its own name; stops always work",
+    )
     STOPPED = "stopped", "a stop arrived before the goal started", "send the goal again"
     FAULTED = (
         "faulted",

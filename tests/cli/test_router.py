@@ -21,11 +21,12 @@ from trirail.cli.key_folder import KeyFolder
 from trirail.cli.router import RouterConfig
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import ConfigError, ServiceError
+from trirail.processes.name_conflict import NameConflict
 from trirail.processes.session_guard import Guard
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.vocabulary import Role
-from waiting import WITHIN
+from waiting import WITHIN, wait_until
 
 pytestmark = pytest.mark.long
 
@@ -289,6 +290,29 @@ def test_the_state_is_thinned_for_each_robot_by_itself(net: Net) -> None:
         for robot in ROBOTS:
             assert found.count(f"trirail/{robot}/summary") >= 10
             assert found.count(f"trirail/{robot}/state") == 1  # the first; the next is due in 100 s
+
+
+def test_two_robots_of_one_name_know_of_each_other_through_the_router(routed: Net) -> None:
+    with Robot(routed, "demo") as one, Robot(routed, "demo") as two, Robot(routed, "other") as other:
+        conflicts = [
+            NameConflict(
+                robot.session, robot.config.robot.name, run, partial(robot.guard.linked, robot.session),
+                robot.guard.open_client, lambda _: None,
+            )
+            for run, robot in (("1", one), ("2", two), ("3", other))
+        ]  # fmt: skip
+
+        def known() -> list[bool]:
+            for conflict in conflicts:
+                conflict.poll()
+            return [bool(conflict._tokens) for conflict in conflicts]
+
+        wait_until(lambda: known() == [True, True, False])
+        with routed.session("max") as forger, forger.liveliness().declare_token("trirail/other/run/4"):
+            until_answered(forger, "trirail/other/info")
+            assert known() == [True, True, False]  # users are no services
+        for conflict in conflicts:
+            conflict.close()
 
 
 def test_what_is_printed_is_a_configuration_of_zenohd(

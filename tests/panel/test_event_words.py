@@ -34,7 +34,7 @@ VOCABULARY: dict[str, tuple[str, ...]] = {
 """Parameters whose values are words that the page knows."""
 TEXTS = {
     *("goal", "user", "before", "name", "slider", "drives", "drive", "error", "warning", "reason", "pose", "file"),
-    *("next", "files", "id", "router"),
+    *("next", "files", "id", "router", "robot"),
 }
 """Parameters whose values are names and texts from elsewhere, shown as they are."""
 

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 from processes.test_service import Service, until, wait_readable
+from refusals import refused_as
 from trirail.client.client import Robot
 from trirail.client.fleet import Attention, Fleet, Member
-from trirail.errors import ServiceError
+from trirail.errors import RefusalCode, ServiceError
 from trirail.processes.operating_system import python
+from trirail.wire.event_codes import EventCode
 from waiting import WITHIN
 from warm import trirail
 
@@ -119,6 +121,29 @@ def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub
     with through(hub) as robot:
         until(robot, lambda state: state.mode == "holding")
         robot.disable()
+
+
+def test_a_second_service_of_the_same_name_moves_nothing_and_is_told_until_one_is_gone(
+    hub: Hub, service: Service, tmp_path: Path
+) -> None:
+    folder = tmp_path / "second"
+    folder.mkdir()
+    listen = f'listen = ["unixsock-stream/{folder}/zenoh"]'
+    with Service(folder, **{listen: f'{listen}\nconnect = ["{hub.locator}"]'}) as second, through(hub) as robot:
+        second.wait_up()
+        with refused_as(RefusalCode.NAME_IN_USE):
+            robot.enable()
+        for each in (service, second):
+            with each.robot() as local:
+                with refused_as(RefusalCode.NAME_IN_USE):
+                    local.enable()
+                told = (event for event in local.events(history=True) if event.event_code is EventCode.NAME_IN_USE)
+                assert next(told).level == "error"
+                until(local, lambda state: any("another service" in warning for warning in state.warnings))
+                local.stop()
+    with service.robot() as robot:
+        until(robot, lambda state: not state.warnings)
+        robot.enable()
 
 
 def test_a_robot_that_is_killed_is_silent_to_the_fleet(hub: Hub, service: Service) -> None:

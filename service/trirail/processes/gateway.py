@@ -24,6 +24,7 @@ from trirail.processes.incoming import Incoming
 from trirail.processes.loop_death import LoopDeath
 from trirail.processes.memory_budget import HeapTrim
 from trirail.processes.monitoring import Meter
+from trirail.processes.name_conflict import REFUSED, NameConflict
 from trirail.processes.order import Order
 from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications, StateMaker, info
@@ -83,7 +84,7 @@ class Gateway:
         urgent_section: Callable[[], AbstractContextManager[None]] = nullcontext,
         *,
         again: bool = False,
-        run: str = "",
+        run: str = "unnamed",
     ) -> None:
         """Create and connect the parts of the gateway. `again` is True if the service has already had a gateway, and
         `run` is the identity of this run of the service.
@@ -115,7 +116,9 @@ class Gateway:
             self._requests, self._replies, self._states, self._inbox, self._parts, self._refusals.refuse
         )
         connect = config.zenoh.connect
-        self._routers = RouterLinks(connect, partial(guard.linked, session), guard.why_not_linked, self._announce)
+        linked = partial(guard.linked, session)
+        self._routers = RouterLinks(connect, linked, guard.why_not_linked, self._announce)
+        self._name_conflict = NameConflict(session, self._robot, run, linked, guard.open_client, self._announce)
         known = {*guard.users, config.zenoh.router or ""}
         self._link_monitor = LinkMonitor(
             partial(guard.links, session),
@@ -152,6 +155,7 @@ class Gateway:
                 self._poses.poll()
                 self._routers.poll()
                 self._link_monitor.poll()
+                self._name_conflict.poll()
                 self._requests.expire()
                 self._parts.poll()
                 self._summarize()
@@ -164,6 +168,7 @@ class Gateway:
             with contextlib.suppress(LinkClosed):
                 self._poses.close()
             self._routers.close()
+            self._name_conflict.close()
             for incoming in (*self._requests, *self._parts):
                 self._replies.answer(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             stop_port.close()
@@ -176,6 +181,7 @@ class Gateway:
             *self._poses.warnings(),
             *self._routers.warnings(),
             *self._link_monitor.warnings(),
+            *self._name_conflict.warnings(),
         )
 
     def end(self) -> None:
@@ -211,6 +217,9 @@ class Gateway:
         self._poses.edit(message.incoming, *message.names)
 
     def _command(self, message: RoutedMessage) -> None:
+        _, command = message.names
+        if command in REFUSED:
+            self._name_conflict.check(command)
         self._commands.read(message.incoming, *message.names)
 
     def _forward_look(self, message: RoutedMessage) -> AlignmentLook:
@@ -218,6 +227,7 @@ class Gateway:
         return self._looks.forward(user, message.content)
 
     def _goal(self, message: RoutedMessage) -> None:
+        self._name_conflict.check("a goal")
         incoming, (user,), sent = message
         if not isinstance(sent, TrajectoryGoal):
             self._requests.goal(incoming, user, self._poses.resolve_name(sent))

@@ -67,6 +67,10 @@ class Guard:
             path.chmod(SOCKET_MODE)
         return opened
 
+    def open_client(self, endpoint: str) -> zenoh.Session:
+        """Open a client session to a router with the service's certificate. Raises ServiceError."""
+        return zenoh_session.open_client(endpoint, self._credentials)
+
     def stop_port(self, take: Callable[[StopRequest, Answer], None]) -> StopPort:
         """Open a stop port for each endpoint. `warnings` lists the endpoints for which that failed."""
 

@@ -101,8 +101,11 @@ def _certificate_rules(robot: str) -> Iterator[_Rule]:
 
 
 def _router_rules(robot: str) -> Iterator[_Rule]:
-    """Yield the rules that apply only to a router, which may forward messages of every user."""
+    """Yield the rules that apply only to a router, which may forward messages of every user, and of other services."""
     yield from _user_rules(robot, "*", Role.MAINTAINER)
+    run = key(robot, "run", "*")
+    yield _rule("watch other services", "egress", ("declare_liveliness_subscriber", "liveliness_token"), run)
+    yield _rule("other services are there", "ingress", ("liveliness_token",), run)
 
 
 def _mirrored(name: str, rule: _Rule) -> _Rule:

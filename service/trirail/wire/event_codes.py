@@ -109,6 +109,7 @@ class EventCode(StrEnum):
     # The network.
     ROUTER_LINKED = "router_linked", "the gateway is connected to a router", "router"
     ROUTER_LOST = "router_lost", "the gateway has no connection to a router", "router"
+    NAME_IN_USE = "name_in_use", "another service in the Zenoh network has the same robot name", "robot"
     SESSIONS_FULL = "sessions_full", "nearly as many sessions as the gateway accepts", "used", "most"
     DESCRIPTORS_FULL = "descriptors_full", "nearly as many file descriptors as the gateway may open", "used", "most"
     CONNECTIONS_WAIT = "connections_wait", "many connections open no session", "count", "wait"

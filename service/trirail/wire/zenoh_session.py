@@ -82,7 +82,8 @@ def router(
     """
     settings = _COMMON_SETTINGS | {
         "mode": "router",
-        **serving(listen, credentials, access_control, connect, len(thinned) + SESSIONS),
+        # Each robot has two sessions to the router; see trirail.processes.name_conflict.
+        **serving(listen, credentials, access_control, connect, 2 * len(thinned) + SESSIONS),
         "downsampling": [
             {
                 "id": f"thinned {number}",
@@ -173,7 +174,7 @@ def linked(opened: zenoh.Session, endpoints: Sequence[str], router: str | None) 
 
     With `router`, only connections to a certificate with this common name count.
     """
-    links = opened.info.links()
+    links = opened.info.links() if endpoints else []
     reached = [str(link.dst) for link in links if router is None or link.auth_identifier == router]
     return {endpoint for endpoint in endpoints if any(leads_to(endpoint, other) for other in reached)}
 
