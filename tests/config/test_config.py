@@ -721,7 +721,7 @@ def test_backlash_leaves_travel_and_a_pose_in_its_reserve_is_refused_with_the_re
         parse(f"{narrow}\n[correction]\nbacklash = [1e-3, 0.0, 0.0]\n")
     play = f"{text}\n[correction]\nbacklash = [2e-5, 0.0, 0.0]\n[poses]\n"
     assert parse(f"{play}load = [0.00999, 0.0, 0.0]\n")
-    with pytest.raises(ConfigError, match=r"slider U would be 0.009995.*half of the widest correction.backlash"):
+    with pytest.raises(ConfigError, match=r"slider U would be 0.009995, closer than 1e-05 m .*half of the widest"):
         parse(f"{play}load = [0.009995, 0.0, 0.0]\n")
 
 

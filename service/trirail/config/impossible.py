@@ -271,10 +271,14 @@ def _check_pose(config: Config, name: str) -> None:
         for label, at in zip(robot.labels, passive, strict=True)
     ]
     for coordinate, at, key, (low, high) in places:
+        numbers = ", ".join(f"{value:g}" for value in pose)
+        if not low - ROUNDING <= at <= high + ROUNDING:
+            raise ConfigError(
+                f"poses.{name} = [{numbers}]: {coordinate} would be {at:.6g}, outside {key} = [{low:g}, {high:g}]"
+            )
         less = reserve if coordinate.startswith("slider") else 0.0
         if not low + less - ROUNDING <= at <= high - less + ROUNDING:
-            numbers = ", ".join(f"{value:g}" for value in pose)
-            kept = f"; half of the widest correction.backlash, {less:g} m, is kept free at each end" if less else ""
             raise ConfigError(
-                f"poses.{name} = [{numbers}]: {coordinate} would be {at:.6g}, outside {key} = [{low:g}, {high:g}]{kept}"
+                f"poses.{name} = [{numbers}]: {coordinate} would be {at:.6g}, closer than {less:g} m to an end of "
+                f"{key} = [{low:g}, {high:g}]; half of the widest correction.backlash is kept free there"
             )
