@@ -727,7 +727,7 @@ def test_backlash_leaves_travel_and_a_pose_in_its_reserve_is_refused_with_the_re
 
 def test_a_recording_of_an_earlier_version_is_read_although_its_configuration_would_be_refused_now() -> None:
     text = f"{TEXT}\n[poses]\nfar = [9.0, 0.0, 0.0]\n"
-    with pytest.raises(ConfigError, match="poses.far"):
+    with pytest.raises(ConfigError, match=r"poses\.far"):
         parse(text)
     recorded = provenance.configuration({provenance.CONFIGURATION: text})
     assert recorded is not None

@@ -34,7 +34,7 @@ from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
 from trirail.wire import links
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
-from trirail.wire.marks import StopAt
+from trirail.wire.marks import Mark, StopAt
 from trirail.wire.packets import (
     CommandRequest,
     ControlInput,
@@ -503,6 +503,88 @@ def test_a_warning_of_the_bus_beside_a_decision_is_reported(tmp_path: Path) -> N
     reported = [each.event.cycle for each in events if "error-passive" in each.event.message]
     assert len(reported) == 1
     assert 0 <= reported[0] - began[4] <= 3
+
+
+@pytest.mark.parametrize("beside", [(0, 0), (1, 1), (2, 2)])
+def test_the_override_acts_again_after_a_goal_that_forbids_it_has_been_refused(
+    beside: tuple[int, int], tmp_path: Path
+) -> None:
+    """While the goal is planned, the motion before it slows down; nothing else is decided afterwards."""
+    session = Session(PINS, tmp_path, "unix", quiet=True)
+    quiet_of(session).cycles_beside = beside
+    merged = Mark("valve", start=0.002, end=0.03, increment=0.0004, pulse_width=0.02)
+    requests: list[CommandRequest | GoalRequest] = [
+        CommandRequest(30, "ann", Command.ENABLE),
+        CommandRequest(60, "ann", Command.OVERRIDE, carried(Command.OVERRIDE, 1.5)),
+        GoalRequest(100, "ann", "a", PoseGoal(0.09, 0.05, 0.0, speed=0.2, blend=0.01), 0),
+        GoalRequest(400, "ann", "b", PoseGoal(0.0, 0.0, 0.0, speed=0.3, blend=0.01, marks=(merged,)), 0),
+    ]
+    happens: dict[int, list[Happening]] = {
+        each.ticket: [Happening(lambda session, each=each: session.ask(each))]  # type: ignore[misc]
+        for each in requests
+    }
+    try:
+        records, inputs, events = recorded(session, happens, 1000)
+    finally:
+        session.close()
+    assert [each.event.outcome for each in events if each.event.kind == "goal" and each.event.id == "b"] == ["rejected"]
+    speeds = np.linalg.norm(records["commanded_pose_velocity"][:, :2], axis=1)
+    assert speeds[800] > 1.9 * speeds[390]
+    assert not replayed(PINS, records, inputs).any()
+
+
+def test_what_a_command_to_the_drives_beside_cycles_warns_of_is_reported(tmp_path: Path) -> None:
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    quiet_of(session).cycles_beside = 1, 1
+    disable = session.driver.disable
+
+    def refused() -> None:
+        session.ends.leave_room(0)
+        disable()
+
+    session.driver.disable = refused  # type: ignore[method-assign]
+    happens: dict[int, list[Happening]] = {
+        30: [Happening(lambda session: session.ask(CommandRequest(30, "ann", Command.ENABLE)))],
+        200: [Happening(lambda session: session.ask(GoalRequest(200, "ann", "g", PoseGoal(0.08, 0.0, 0.0), 0)))],
+        300: [Happening(lambda session: session.ask(CommandRequest(300, "ann", Command.DISABLE)))],
+    }
+    try:
+        _, _, events = recorded(session, happens, 700)
+    finally:
+        session.close()
+    assert len([each for each in events if "cannot send" in each.event.message]) == 1
+
+
+@pytest.mark.parametrize("strange", [False, True])
+@pytest.mark.parametrize("number", [1, 2])
+def test_commands_to_the_drives_know_the_next_tick(number: int, strange: bool, tmp_path: Path) -> None:
+    """They would delay the SYNC; also if a frame that nobody expected has made Python finish the cycles beside."""
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    quiet = quiet_of(session)
+    quiet.cycles_beside = number, number
+    run_beside, disable, known = quiet.run_beside, session.driver.disable, list[tuple[float, float]]()
+
+    def ambushed(*arguments: Any) -> Any:
+        if strange and session.loop.control.cycles > 340:
+            session.inject(CAN_FRAME.pack(0x123, 2, b"ab"))
+        return run_beside(*arguments)
+
+    def noted() -> None:
+        known.append((session.driver.next_sync, session.ticker.deadline_ns * 1e-9 + session.loop.control.period))
+        disable()
+
+    quiet.run_beside, session.driver.disable = ambushed, noted  # type: ignore[assignment, method-assign]
+    happens: dict[int, list[Happening]] = {
+        30: [Happening(lambda session: session.ask(CommandRequest(30, "ann", Command.ENABLE)))],
+        200: [Happening(lambda session: session.ask(GoalRequest(200, "ann", "g", PoseGoal(0.08, 0.0, 0.0), 0)))],
+        300: [Happening(lambda session: session.ask(CommandRequest(300, "ann", Command.DISABLE)))],
+    }
+    try:
+        session.run(happens, 700)
+    finally:
+        session.close()
+    ((next_sync, tick),) = known
+    assert next_sync == pytest.approx(tick, abs=1e-6)
 
 
 PATHS = ((200, 0.2), (500, 0.2345), (800, 0.25), (1100, 0.3))

@@ -130,3 +130,41 @@ def test_outputs_by_sdo_are_left_to_python(tmp_path: Path, monkeypatch: pytest.M
     assert isinstance(valve, SimulatedDrive)
     assert [change.bits >> 16 for change in valve.pins.history] == [1, 0, 1, 0]
     assert one.loop.control.fault is None
+
+
+def test_an_output_by_sdo_whose_request_is_lost_is_sent_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = ObjectEntry.__init__
+
+    def unmappable(entry: ObjectEntry, variable: ODVariable) -> None:
+        made(entry, variable)
+        entry.mappable = entry.mappable and entry.index != 0x60FE
+
+    monkeypatch.setattr(ObjectEntry, "__init__", unmappable)
+    session = Session(PINS, tmp_path, "unix", quiet=True)
+    take, lost = session.ends.take, list[bytes]()
+
+    def lossy() -> bytes | None:
+        packet = take()
+        while packet is not None and not lost and packet[:2] == b"\x01\x06" and packet[9:11] == b"\xfe\x60":
+            lost.append(packet)
+            packet = take()
+        return packet
+
+    happens: dict[int, list[Happening]] = {
+        30: [Happening(lambda session: session.ask(CommandRequest(30, "ann", Command.ENABLE)))],
+        300: [
+            Happening(lambda session: setattr(session.ends, "take", lossy)),
+            Happening(
+                lambda session: session.ask(CommandRequest(300, "ann", Command.SET_OUTPUT, SetOutput("valve", True)))
+            ),
+        ],
+    }
+    try:
+        session.run(happens, 1200)
+        valve = session.drives.drives[0]
+        assert isinstance(valve, SimulatedDrive)
+        assert len(lost) == 1
+        assert [change.bits >> 16 for change in valve.pins.history] == [1]
+        assert session.loop.quiet_cycles > 300
+    finally:
+        session.close()

@@ -234,15 +234,15 @@ class Cia402(Driver[Cia402Axis]):
                 self._wire.fail(fault)
         if self._axes[0].syncs == self._requested_after:  # no SYNC since the last `write`, so no setpoints will follow
             self._poll(now)
-        return self._feedback()
+        return self._feedback(self._wire.warnings())
 
-    def _feedback(self) -> Feedback:
+    def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
         a, b, c = self._axes
         return Feedback(
             (a.position, b.position, c.position),
             (a.shown_state, b.shown_state, c.shown_state),
             self._wire.fault,
-            self._wire.warnings(),
+            warnings,
             (a.age, b.age, c.age),
             self._homing.under_way,
             (a.follows, b.follows, c.follows),
@@ -349,7 +349,8 @@ class Cia402(Driver[Cia402Axis]):
             axis.missed_limit = self._drives.missed_positions if wanted is PowerState.OPERATION_ENABLED else 1
             if not axis.is_steady(wanted):
                 return None
-        if any(outputs_pending(axis) and not axis.maps_outputs for axis in self._axes):
+        by_sdo = [axis for axis in self._axes if axis.has_outputs and not axis.maps_outputs]
+        if any(outputs_pending(axis) or axis.unanswered for axis in by_sdo):  # a lost request is sent again
             return None
         lent, beats = self._tables, len(self._beats)
         lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NO_OFFSET, *lent.counts

@@ -121,7 +121,7 @@ class Lender(Protocol):
         """
 
     def reclaim(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
-        """Continue from the tables, and return the feedback.
+        """Continue from the tables, and return the feedback, without new warnings, which `read` returns.
 
         Parameters
         ----------

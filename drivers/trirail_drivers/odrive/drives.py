@@ -163,16 +163,16 @@ class Odrive(Driver[OdriveAxis]):
             if fault is not None:
                 self._wire.fail(fault)
         self._check_stopped(now)
-        return self._feedback()
+        return self._feedback(self._wire.warnings())
 
-    def _feedback(self) -> Feedback:
+    def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
         a, b, c = self._axes
         on = self._enabled
         return Feedback(
             (a.position, b.position, c.position),
             (a.power(on and not a.left_out), b.power(on and not b.left_out), c.power(on and not c.left_out)),
             self._wire.fault,
-            self._wire.warnings(),
+            warnings,
             (a.age, b.age, c.age),
             homed=(a.homed, b.homed, c.homed),
             unready=self._unready,

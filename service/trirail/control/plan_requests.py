@@ -121,6 +121,8 @@ class PlanRequests:
     @property
     def due(self) -> float:
         """Number of cycles until `step` must be called if nothing is received; 0 if it must be called now."""
+        if self._running and self._rate != self._wanted_rate:
+            return 0
         if self._goal is None:
             return math.inf if self._change is None else 0
         asked, answer, now = self._request, self._answer, self._schedule.cycle

@@ -210,6 +210,7 @@ class Loop:
     def _finish_ahead(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
         """Let a decision take effect that was made beside the newest cycles, after cycle `last`."""
         self._finish_beside(quiet, ticker, newest, last)
+        self._drives.next_sync = (ticker.deadline_ns + self._period_ns) * 1e-9
         self.control.modes.send_commands()
         self.control.end_ahead()
         self._send_beside(reports=True)
@@ -221,6 +222,7 @@ class Loop:
         already handled the quick stop.
         """
         reached, tick, done = newest.reached, newest.tick, newest.cycle
+        self._marked_ns = newest.marked_ns
         if reached is not Reached.DONE:
             quiet.leave_at(reached)
         if reached is Reached.WRITTEN:
@@ -228,7 +230,7 @@ class Loop:
         while reached in (Reached.OBSERVED, Reached.SOLVED) or done < last:
             if reached not in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED):
                 tick = ticker.tick() if reached is Reached.WAITED else ticker.wait()
-                self._drives.sync()
+                self._sync()
                 reached = Reached.SYNCED
             if reached is Reached.SYNCED:
                 if self.control.state.mode is Mode.FAULT or self._quick_stop_waits():
@@ -236,6 +238,7 @@ class Loop:
                     self._continue_after_sync(tick)
                     return
                 feedback = self._drives.read()
+                self._mark(Part.READ)
                 if feedback.fault is not None:
                     self._end_ahead(quiet, done)
                     self._handle_urgent(self._watch(tick, feedback), tick.deadline_ns + tick.lateness_ns)
@@ -244,14 +247,18 @@ class Loop:
                     return
                 self._overruns.count(tick.missed)
                 before = self.control.measured.feedback
-                reached = quiet.solve(feedback._replace(warnings=()), tick)  # reported below, and only once
+                self._mark(Part.MODE)
+                # Warnings are reported below, and only once.
+                reached = quiet.solve(feedback._replace(warnings=()), tick, self._marked_ns)
                 quiet.copy_measured_back()
                 self.control.report_feedback(before, feedback)
             if quiet.is_refused(reached):
                 self._end_ahead(quiet, done)
                 self._continue_solved(quiet.result(reached))
                 return
+            self._marked_ns = quiet.marked_ns
             self._drives.write(*quiet.setpoints)
+            self._mark(Part.WRITE)
             done, reached = quiet.record(self._overruns), Reached.DONE
         quiet.copy_measured_back()
 
@@ -278,10 +285,14 @@ class Loop:
 
     def cycle(self, tick: Tick) -> None:
         """Run one cycle in Python. Nothing in a cycle waits, and any failure in a cycle stops the robot."""
+        self._sync()
+        self._continue_after_sync(tick)
+
+    def _sync(self) -> None:
+        """Begin a cycle in Python, at its tick."""
         self._marked_ns = time.perf_counter_ns()
         self._drives.sync()
         self._mark(Part.SYNC)
-        self._continue_after_sync(tick)
 
     def _continue_after_sync(self, tick: Tick) -> None:
         """Run the rest of a cycle after its SYNC. Setpoints are sent before any decision that can wait."""

@@ -286,10 +286,14 @@ class QuietCycles:
         """Let the drives send the setpoints again that the bus has refused."""
         self._drives.send_on(self._state.sent)
 
-    def solve(self, feedback: Feedback, tick: Tick) -> Reached:
-        """Evaluate the feedback of a cycle that Python has begun, and compute its setpoints; return the stage."""
+    def solve(self, feedback: Feedback, tick: Tick, marked_ns: int) -> Reached:
+        """Evaluate the feedback of a cycle that Python has begun, and compute its setpoints; return the stage.
+
+        `marked_ns` is the time at which the cycle's feedback had been read [ns].
+        """
         state = self._state
         state.deadline_ns, state.lateness_ns, state.missed = tick
+        state.marked_ns = marked_ns
         self._control.measured.feedback = feedback
         pack_feedback(feedback, self._robot.feedback, self._robot.record)
         first, moment, frames, robot = self._tables
@@ -299,6 +303,11 @@ class QuietCycles:
     def is_refused(self, reached: Reached) -> bool:
         """Return True if a following error exceeds its limit, or the last gate has refused the setpoints."""
         return reached is Reached.OBSERVED or bool(cycle.refusal(self._state.code))
+
+    @property
+    def marked_ns(self) -> int:
+        """Time at which the newest part of the newest cycle ended [ns]."""
+        return self._state.marked_ns
 
     @property
     def setpoints(self) -> tuple[Triple, Triple]:
