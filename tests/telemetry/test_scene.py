@@ -16,6 +16,7 @@ from trirail.config import SIM, FramesTable, Input, LegTable, Output, load
 from trirail.errors import ServiceError
 from trirail.kinematics.geometry import Geometry, Leg
 from trirail.processes.publications import info
+from trirail.telemetry.columns import Timelines
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.scene import Scene
@@ -66,6 +67,14 @@ def test_every_field_of_every_record_is_kept_as_it_was(scene: Scene) -> None:
     assert np.all(steps == 1_000_000)
     wall = batch.column("wall").to_numpy().astype(int)
     assert np.array_equal(wall, records["deadline_ns"] + WALL_OFFSET_NS)
+
+
+def test_times_go_on_beyond_what_a_product_with_nanoseconds_can_hold() -> None:
+    """The cycles of 107 days at 1 kHz, times 1e9, exceed 64 bits."""
+    records = made.records(0.003)
+    records["cycle"] += 2**63 // 10**9 - 1
+    t = Timelines(1000, 0).for_records(records)["t"].to_numpy().astype(int)
+    assert t.tolist() == [cycle * 1_000_000 for cycle in records["cycle"].tolist()]
 
 
 @pytest.mark.parametrize("geometry", [Geometry.symmetric(0.3), GENERAL], ids=["symmetric", "general"])

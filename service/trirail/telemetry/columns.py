@@ -36,7 +36,9 @@ class Timelines:
 
         The steps of `t` are exact if the period of the loop is a whole number of nanoseconds.
         """
-        t = records["cycle"] * SECOND // self._rate_hz
+        # The cycles times 1e9 would exceed 64 bits after 107 days at 1 kHz.
+        seconds, rest = np.divmod(records["cycle"], self._rate_hz)
+        t = seconds * SECOND + rest * SECOND // self._rate_hz
         return times(t, records["deadline_ns"] + self._wall_offset_ns)
 
 
