@@ -6,7 +6,7 @@ import math
 import re
 from itertools import combinations
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import made
 import numpy as np
@@ -15,11 +15,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rich.style import Style
 from trirail.analysis import charts
-from trirail.analysis.summary import UNKNOWN_LABEL
+from trirail.analysis.summary import UNKNOWN_LABEL, summarise
 from trirail.cli import recording_commands, terminal
 from trirail.config import SIM, load
 from trirail.telemetry import palette
 from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.recording import Recording
 from trirail.wire.goals import SlidersGoal
 from trirail.wire.messages import Event, Outcome
 from trirail.wire.packets import ControlInput, GoalRequest
@@ -95,6 +96,24 @@ def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path:
     assert "and 2 more" in drawn
     assert f"<!-- {name} -->" in drawn
     assert drawn.count("stroke-dasharray") > 2, "the limit that A came near, beside the period and its legend"
+
+
+def test_sliders_are_reported_without_the_backlash_compensation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is in the positions of the drives, and jumps where a slider turns back."""
+    records = made.records(2.0)
+    compensated = records.copy()
+    compensated["backlash"] = np.where(records["velocity"] > 0.0, 1e-3, -1e-3)
+    compensated["position"] += compensated["backlash"]
+    drawn: dict[str, Any] = {}
+    monkeypatch.setattr(charts, "_draw_curves", lambda panel, _, values, __: drawn.update({panel: values}))
+    monkeypatch.setattr(charts, "_label_curves", lambda *_: None)
+    panels: Any = {name: name for name in ("x, y [mm]", "φ [°]", "λ [mm]", "velocity [mm/s]", "error [µm]")}
+    t = np.arange(len(records)) / made.RATE_HZ
+    charts._draw_motion(panels, compensated, t, None, ("A", "B", "C"))
+    assert drawn["λ [mm]"] == pytest.approx(records["position"] * 1e3)
+    wall = t.astype("datetime64[ns]")
+    summaries = [summarise(Recording("demo", each, t, wall, [], {})) for each in (records, compensated)]
+    assert summaries[1].distance == pytest.approx(summaries[0].distance)
 
 
 @pytest.mark.generated(0, 1, 2)

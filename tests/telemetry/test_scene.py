@@ -142,6 +142,19 @@ def test_curves_are_in_the_units_of_people(scene: Scene) -> None:
     assert np.array_equal(t, newest["cycle"] * 1_000_000)
 
 
+def test_sliders_are_drawn_without_the_backlash_compensation(scene: Scene) -> None:
+    """It is in the positions of the drives. The carriages are where the readout and the published state have them."""
+    records = made.records(0.5)
+    compensated = records.copy()
+    compensated["backlash"] = np.where(records["velocity"] > 0.0, 1e-3, -1e-3)
+    compensated["position"] += compensated["backlash"]
+    alone, other = (by_entity(scene.drawn(each, ReadoutState())) for each in (records, compensated))
+    for path, component in (("/sliders/position", "Scalars:scalars"), ("/robot/sliders", "Points2D:positions")):
+        assert values(other[path], component) == pytest.approx(values(alone[path], component), abs=1e-6, nan_ok=True), (
+            path
+        )
+
+
 def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
     records = made.records(0.5)
     records["following_error"][123] = [-2e-3, 1e-3, 0.0]

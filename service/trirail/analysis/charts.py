@@ -19,6 +19,7 @@ from trirail.errors import ConfigError
 from trirail.naming import Labels, label
 from trirail.telemetry import palette, provenance
 from trirail.telemetry.recording import RecordedAlignment, Recording
+from trirail.wire.records import slider_positions
 from trirail.wire.vocabulary import MODES, Mode
 
 __all__ = ["draw"]
@@ -150,7 +151,7 @@ def _draw_motion(
     error = np.where(enabled, records["following_error"], np.nan)
     _draw_curves(panels["x, y [mm]"], t, records["pose"][:, :2] * 1e3, CENTRE)
     _draw_curves(panels["φ [°]"], t, np.degrees(records["pose"][:, 2:]), (PHI,))
-    _draw_curves(panels["λ [mm]"], t, records["position"] * 1e3, SLIDERS)
+    _draw_curves(panels["λ [mm]"], t, slider_positions(records) * 1e3, SLIDERS)
     _draw_curves(panels["velocity [mm/s]"], t, records["commanded_velocity"] * 1e3, SLIDERS)
     _draw_curves(panels["error [µm]"], t, error * 1e6, SLIDERS)
     _label_curves(panels["x, y [mm]"], "xy", CENTRE)
@@ -161,7 +162,7 @@ def _draw_motion(
     for x_or_y, values in zip((platform.x, platform.y), records["pose"][:, :2].T, strict=True):
         _draw_bounds(panels["x, y [mm]"], values * 1e3, x_or_y[0] * 1e3, x_or_y[1] * 1e3)
     for low, high in dict.fromkeys(slider.positions):
-        _draw_bounds(panels["λ [mm]"], records["position"] * 1e3, low * 1e3, high * 1e3)
+        _draw_bounds(panels["λ [mm]"], slider_positions(records) * 1e3, low * 1e3, high * 1e3)
     for velocity in dict.fromkeys(slider.velocities):
         _draw_bounds(panels["velocity [mm/s]"], records["commanded_velocity"] * 1e3, -velocity * 1e3, velocity * 1e3)
     allowed = slider.following_error * 1e6

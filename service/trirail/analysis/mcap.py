@@ -27,6 +27,7 @@ from trirail.kinematics.robot import inverse, jacobians
 from trirail.telemetry import provenance
 from trirail.telemetry.journal import Line
 from trirail.telemetry.recording import Recording
+from trirail.wire.records import slider_positions
 from trirail.wire.vocabulary import MODES, Mode
 
 # The definitions of these messages are the same in the ROS 2 releases Jazzy, Kilted and Lyrical.
@@ -95,7 +96,7 @@ def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray
     With a correction map, the legs lead to the corrected pose. The URDF has no map, so its legs meet only if the
     passive joints are those of this pose.
     """
-    sliders, velocity, pose = records["position"] - records["backlash"], records["velocity"], records["pose"]
+    sliders, velocity, pose = slider_positions(records), records["velocity"], records["pose"]
     if geometry.correction is not None:
         pose = pose + geometry.correction.at(pose)
         geometry = dataclasses.replace(geometry, correction=None)

@@ -26,6 +26,7 @@ from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goals import Coordinates, Goal, NamedGoal
 from trirail.wire.kinds.pose import pose_in_place_of
 from trirail.wire.messages import ErrorReply, Notice
+from trirail.wire.records import slider_positions
 from trirail.wire.state import NamedPose, NamedPoses
 from trirail.wire.text import check_new_pose
 from trirail.wire.vocabulary import MODES, Mode
@@ -256,7 +257,7 @@ class Poses:
             raise RefusedError(RefusalCode.NOT_HOMED, "the positions of the sliders are unknown: send home first")
         x, y, phi = record["pose"].tolist()
         there = travels(self._geometry, (x, y, phi))[0]
-        if not np.abs(there - record["position"] + record["backlash"]).max() <= MAX_CLOSURE_ERROR_M:
+        if not np.abs(there - slider_positions(record)).max() <= MAX_CLOSURE_ERROR_M:
             raise RefusedError(
                 RefusalCode.SINGULAR, "the slider positions do not correspond to any pose: move the sliders"
             )

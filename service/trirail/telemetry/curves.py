@@ -13,6 +13,7 @@ from trirail.naming import Labels
 from trirail.telemetry import palette
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.palette import Colour
+from trirail.wire.records import slider_positions
 
 POSITION, VELOCITY, ACCELERATION = "/sliders/position", "/sliders/velocity", "/sliders/acceleration"
 ERROR = "/sliders/following_error"
@@ -90,7 +91,7 @@ def values(
     highest, lowest = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
     times = np.stack([records["parts_ns"].sum(axis=1), records["lateness_ns"]], axis=1)
     return {
-        POSITION: newest["position"] * 1e3,  # [mm]
+        POSITION: slider_positions(newest) * 1e3,  # [mm]
         VELOCITY: newest["velocity"] * 1e3,  # [mm/s]
         ACCELERATION: newest["commanded_acceleration"],  # [m/s²]
         ERROR: np.where(highest > -lowest, highest, lowest) * 1e6,  # [µm]

@@ -9,6 +9,7 @@ import numpy as np
 from trirail_drivers.interface import NAMES
 
 from trirail.naming import Labels
+from trirail.wire.records import slider_positions
 from trirail.wire.vocabulary import MODES, Mode
 
 PATH = "/readout"
@@ -42,7 +43,7 @@ def markdown(record: np.void, state: ReadoutState, names: Labels = NAMES) -> str
         head += f"   goal **{state.goal.translate(_ESCAPES)}**: {share:.0%}, {words}"
     wrong = [f"**{state.fault.translate(_ESCAPES)}**"] if state.fault else []
     target = ["–"] * 3 if state.target is None else _pose(state.target)
-    place = record["position"] - record["backlash"]
+    place = slider_positions(record)
     rows = [
         ("measured", *_pose(record["pose"]), "λ [mm]", *(f"{value * 1e3:.3f}" for value in place)),
         ("commanded", *_pose(record["commanded_pose"]), "v [mm/s]", *(f"{v * 1e3:.1f}" for v in record["velocity"])),

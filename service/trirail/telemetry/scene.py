@@ -24,6 +24,7 @@ from trirail.telemetry.columns import FIELDS, RECORD, Column
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.palette import Colour
 from trirail.telemetry.readout import ReadoutState
+from trirail.wire.records import slider_positions
 from trirail.wire.vocabulary import MODES
 from trirail.workspace import part_positions
 from trirail.workspace.part_positions import Points, RobotParts
@@ -78,7 +79,7 @@ def moving(geometry: Geometry, parts: RobotParts, before: NDArray[np.void], reco
 
     The trace of the platform's centre connects each record of `before`, (N,), with that of `records`.
     """
-    sliders = part_positions.slider_points(geometry, records["position"])
+    sliders = part_positions.slider_points(geometry, slider_positions(records))
     crossing = part_positions.cross_slide_lines(geometry, parts, sliders, records["pose"][:, 2])
     pivots = part_positions.pivot_points(geometry, sliders, records["pose"])
     steps = np.stack([before["pose"][:, :2], records["pose"][:, :2]], axis=1)[:, None]

@@ -91,6 +91,12 @@ def unpack(batch: bytes | memoryview) -> NDArray[np.void]:
     return np.frombuffer(batch, DTYPE)
 
 
+def slider_positions(records: NDArray[np.void] | np.void) -> NDArray[np.float64]:
+    """Return the measured positions lambda_10 of the sliders [m], without the backlash compensation of the drives."""
+    positions: NDArray[np.float64] = records["position"] - records["backlash"]
+    return positions
+
+
 def checked(payload: bytes) -> bytes:
     """Check a batch of records; return the batch.
 
