@@ -246,15 +246,15 @@ def test_the_oldest_recordings_go_and_black_boxes_last(tmp_path: Path) -> None:
     mine = kept(tmp_path, "my-best.rrd", 50)
     live = kept(tmp_path, "other-20260101-090000.rrd", 4)
     lock = retention.lock(live)
-    assert retention.tidy(tmp_path, 18e6) == []
-    assert retention.tidy(tmp_path, 17e6) == [old]
+    assert retention.tidy(tmp_path, 18e6).deleted == []
+    assert retention.tidy(tmp_path, 17e6).deleted == [old]
     assert not log.exists()
-    assert retention.tidy(tmp_path, 8e6) == [part]
-    assert retention.tidy(tmp_path, 7e6) == [box]
-    assert retention.tidy(tmp_path, 1e6) == []  # what is being written stays
+    assert retention.tidy(tmp_path, 8e6).deleted == [part]
+    assert retention.tidy(tmp_path, 7e6).deleted == [box]
+    assert retention.tidy(tmp_path, 1e6).deleted == []  # what is being written stays
     assert mine.exists()
     retention.unlock(lock)
-    assert retention.tidy(tmp_path, 1e6) == [live]
+    assert retention.tidy(tmp_path, 1e6).deleted == [live]
 
 
 @settings(max_examples=30)
@@ -278,7 +278,7 @@ def test_parts_of_the_running_session_go_last_whatever_clocks_said(
         for name in parts:
             kept(folder, f"{name}.rrd", 1)
         in_order = [*sorted(names, key=names.__getitem__), *parts]
-        deleted = retention.tidy(folder, at_most * 1e6, session)
+        deleted = retention.tidy(folder, at_most * 1e6, session).deleted
         assert [path.stem for path in deleted] == in_order[: max(0, len(in_order) - at_most)]
 
 
@@ -290,7 +290,7 @@ def test_every_name_that_the_recorder_chooses_is_counted_and_deleted(tmp_path: P
     for path in in_order:
         os.truncate(path, 1_000_000)
     for left in reversed(range(len(in_order))):
-        (oldest,) = retention.tidy(tmp_path, left * 1e6)
+        (oldest,) = retention.tidy(tmp_path, left * 1e6).deleted
         assert oldest == in_order[-1 - left]
 
 
@@ -299,7 +299,7 @@ def test_another_session_of_the_same_second_goes_before_the_running_one(tmp_path
     part = claim(tmp_path, f"{running.stem}-part2")
     for path in (running, other, part):
         os.truncate(path, 1_000_000)
-    assert retention.tidy(tmp_path, 2e6, running.stem) == [other]
+    assert retention.tidy(tmp_path, 2e6, running.stem).deleted == [other]
 
 
 def test_the_recorder_tidies_its_folder(tmp_path: Path) -> None:
@@ -310,6 +310,26 @@ def test_the_recorder_tidies_its_folder(tmp_path: Path) -> None:
     recording.close()
     assert parts(tmp_path) == [recording.path]
     assert told == [f"old recordings deleted, because all recordings exceed telemetry.keep_mb = 2: {old.name}"]
+
+
+def test_a_recording_that_cannot_be_deleted_leaves_the_others_to_be_deleted(tmp_path: Path) -> None:
+    """It is reported once, and once more if it could not be deleted again after it could."""
+    stuck = tmp_path / "demo-20250101-110000.rrd"  # a folder cannot be unlinked, by root either
+    time, told = Time(), list[str]()
+    recording = recorder(tmp_path, time, configured(keep_mb=6.0), warn=lambda text: told.append(text.text))
+    sent = made.records(50.0)
+    for minute, is_stuck in enumerate((True, True, False, True)):
+        if is_stuck:
+            stuck.mkdir(exist_ok=True)
+        elif stuck.exists():
+            stuck.rmdir()
+        old = [kept(tmp_path, f"demo-2025020{day}-11000{minute}.rrd", 4) for day in (1, 2)]
+        feed(recording, sent[11_000 * minute : 11_000 * (minute + 1)], time)
+        assert not old[0].exists()
+    recording.close()
+    assert [words.partition(":")[0] for words in told if "cannot" in words] == ["cannot delete old recordings"] * 2
+    assert str(stuck) in told[1]
+    assert sum("old recordings deleted" in words for words in told) == 4
 
 
 def test_logs_of_frames_go_with_their_recordings(tmp_path: Path) -> None:

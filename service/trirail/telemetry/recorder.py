@@ -349,20 +349,18 @@ class Recorder:
             volumes.turn()
 
     def _tidy(self, folder: Path, at_most: float) -> None:
-        try:
-            deleted = retention.tidy(folder, at_most, self._first.stem)
-            if deleted:
-                names = ", ".join(path.name for path in deleted)
-                words = (
-                    f"old recordings deleted, because all recordings exceed telemetry.keep_mb = {at_most / MB:g}: "
-                    f"{names}"
-                )
-                self._warn(coded(words, EventCode.RECORDINGS_DELETED, keep_mb=at_most / MB, files=names))
-        except OSError as error:
-            words = f"cannot delete old recordings: {error}"
-            if words != self._tidy_error:
-                self._tidy_error = words
-                self._warn(coded(words, EventCode.RECORDINGS_KEPT, error=str(error)))
+        deleted, errors = retention.tidy(folder, at_most, self._first.stem)
+        if deleted:
+            names = ", ".join(path.name for path in deleted)
+            words = (
+                f"old recordings deleted, because all recordings exceed telemetry.keep_mb = {at_most / MB:g}: {names}"
+            )
+            self._warn(coded(words, EventCode.RECORDINGS_DELETED, keep_mb=at_most / MB, files=names))
+        others = f", and {len(errors) - 1} more" if len(errors) > 1 else ""
+        why = f"{errors[0]}{others}" if errors else ""
+        if why and why != self._tidy_error:
+            self._warn(coded(f"cannot delete old recordings: {why}", EventCode.RECORDINGS_KEPT, error=why))
+        self._tidy_error = why
 
     def _missing_text(self) -> str:
         """Return a message about missing data if any count has changed since the last message; otherwise return ""."""

@@ -84,15 +84,27 @@ def is_being_written(path: Path) -> bool:
     return False
 
 
-def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
-    """Delete the oldest recordings until the others need at most `at_most` bytes; return the deleted recordings.
+class Tidied(NamedTuple):
+    """Result of a deletion of old recordings."""
+
+    deleted: list[Path]
+    errors: list[OSError]
+    """Reasons why older recordings could not be deleted."""
+
+
+def tidy(directory: Path, at_most: float, session: str = "") -> Tidied:
+    """Delete the oldest recordings until the others need at most `at_most` bytes.
 
     Recordings of the running `session` are deleted after those of other sessions, regardless of their dates. Black
-    boxes are deleted last. A file that is being written is not deleted. Raises OSError if a file cannot be deleted.
+    boxes are deleted last. A file that is being written is not deleted. A recording that cannot be deleted is reported
+    and does not count, because all others would be deleted in its place if it were large.
     """
-    recordings = sorted(_recordings(directory, session), key=lambda kept: kept.order)
+    try:
+        recordings = sorted(_recordings(directory, session), key=lambda kept: kept.order)
+    except OSError as error:
+        return Tidied([], [error])
     total = sum(kept.size for kept in recordings)
-    deleted: list[Path] = []
+    deleted, errors = list[Path](), list[OSError]()
     for kept in recordings:
         if total <= at_most:
             break
@@ -103,10 +115,12 @@ def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
                 path.unlink()
         except FileNotFoundError:  # another process has just deleted the recording
             pass
+        except OSError as error:
+            errors.append(error)
         else:
             deleted.append(kept.path)
         total -= kept.size
-    return deleted
+    return Tidied(deleted, errors)
 
 
 def _recordings(directory: Path, session: str) -> Iterator[_StoredRecording]:
@@ -117,7 +131,7 @@ def _recordings(directory: Path, session: str) -> Iterator[_StoredRecording]:
         try:
             log = path.with_suffix(".log")
             size = path.stat().st_size + (log.stat().st_size if log.exists() else 0)
-        except FileNotFoundError:
+        except OSError:  # another process has just deleted the recording, or it is a link that leads nowhere
             continue
         name, date = match["name"], match["date"]
         number, part, again = (int(match[key] or 1) for key in ("number", "part", "again"))
