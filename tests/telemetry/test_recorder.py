@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import resource
 import shutil
 import socket
 import tempfile
 import threading
+import weakref
 from collections import namedtuple
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.rotation import RotatedFiles
 from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, is_watched
 from trirail.telemetry.streams import Streams
 from trirail.wire.messages import Event
@@ -223,6 +226,35 @@ def test_a_stuck_disk_is_left_alone_until_it_answers() -> None:
     assert archive.lost == 2
     archive.close()
     assert stream.closed
+
+
+@pytest.mark.parametrize("fails", ["before", "at that moment", "at the end"])
+def test_a_stream_whose_disk_fails_when_its_file_ends_is_not_destroyed(fails: str, tmp_path: Path) -> None:
+    """Rerun would wait for the disk, and the recorder with it."""
+    streams: list[_Stream] = []
+    (tmp_path / "a.rrd").touch()
+    files = RotatedFiles(tmp_path / "a.rrd", lambda _: _begun(streams), lambda _: None, 0, lambda: 0.0)  # type: ignore[arg-type,return-value]
+    stream = streams.pop()
+    first = weakref.ref(stream)
+    if fails == "before":
+        stream.stuck = True
+        files.write_chunks([])
+    stream.stuck = True
+    del stream
+    if fails == "at the end":
+        files.close()
+        del files
+    else:
+        assert files.turn()
+    gc.collect()
+    alive = first()
+    assert alive is not None
+    assert not alive.closed
+
+
+def _begun(streams: list[_Stream]) -> _Stream:
+    streams.append(_Stream())
+    return streams[-1]
 
 
 class _Stream:

@@ -54,7 +54,6 @@ class RotatedFiles:
         self._warn = warn
         self._number = 1
         self._lost_before = 0
-        self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # never destroyed, which would wait for the disk
         self._retry: float | None = None
         self._lock = -1
         """Descriptor of the lock by which other processes recognise that the newest file is being written."""
@@ -114,10 +113,7 @@ class RotatedFiles:
         except OSError:
             return False
         self._lost_before += self._archive.lost
-        if self._archive.stuck:
-            self._failed.append((self._stream, self._archive))
-        else:
-            self._archive.close()
+        self._archive.close()
         self._end(self._stream)
         retention.unlock(self._lock)
         self.path, self._number = path, number

@@ -52,6 +52,10 @@ def identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
+_unfinished: list[rr.RecordingStream] = []
+"""Streams whose disk did not respond when they were closed. They are never destroyed, which would wait for the disk."""
+
+
 class Archive:
     """Writer of a recording file.
 
@@ -90,6 +94,8 @@ class Archive:
         """Finish the file, unless the disk does not respond."""
         if self._flushed(DISK_TIMEOUT_S):
             self._stream.disconnect()
+        else:
+            _unfinished.append(self._stream)
 
     def _write(self, chunks: list[Chunk]) -> str:
         """Write a batch; return the reason for a failure, or "" on success."""
