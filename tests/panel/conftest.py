@@ -8,7 +8,7 @@ import pytest
 from chromium import Page, chromium
 from panel.fake_robot import FakeRobot
 from trirail.client import held_jog
-from trirail.panel import tab, tab_requests
+from trirail.panel import tab_requests
 from trirail.panel.server import Panel
 
 SHOWN = "document.body.dataset.contact === 'yes'"
@@ -23,6 +23,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 @pytest.fixture
 def robot() -> FakeRobot:
     return FakeRobot()
+
+
+@pytest.fixture(autouse=True)
+def _slow_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Accept what is pressed late: on a busy machine a browser draws a state when it is given the time for it."""
+    monkeypatch.setattr(tab_requests, "MAX_STATE_AGE_MS", 5000)
 
 
 @pytest.fixture
@@ -51,6 +57,4 @@ def enabled(page: Page, robot: FakeRobot) -> Page:
 def slow_hand(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
     """Take a hand's signs that come late: on a busy machine a browser says no more than it is given the time for."""
     monkeypatch.setattr(held_jog, "TIMEOUT", 2.0)
-    for module in (tab, tab_requests):
-        monkeypatch.setattr(module, "MAX_STATE_AGE_MS", 5000)
     panel._files["hold.js"] = panel._files["hold.js"].replace(b"HUNG = 180;", b"HUNG = 1800;")

@@ -174,7 +174,7 @@ def _opens(url: str) -> bool:
 @pytest.mark.parametrize("name", ["stop", "goto"])
 def test_commands_that_nobody_answers_are_bounded_and_hinder_no_stop(name: str) -> None:
     robot = FakeRobot()
-    goto = '{"do": "goal", "goal": {"kind": "named", "name": "park"}}'
+    goto = '{"do": "goal", "goal": {"kind": "named", "name": "park"}, "seen": 9999999999999}'
     ask = {"stop": '{"do": "command", "name": "stop"}', "goto": goto}[name]
     with Panel(robot.robot(), 0) as inside, connect(f"{inside.url.replace('http', 'ws')}socket", legacy=True) as tab:
         with robot.hanging({"stop": "stop", "goto": "goal"}[name]):

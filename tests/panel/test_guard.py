@@ -23,12 +23,12 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
-from trirail.panel import feed
+from trirail.panel import feed, tab_requests
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import MAX_MESSAGE, Panel, refused
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.state import Info
-from waiting import WITHIN
+from waiting import WITHIN, wait_until
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -371,11 +371,83 @@ def test_the_last_override_counts_however_slow_the_answers_are() -> None:
 
         with robot.hanging("override"):
             for percent in (95, 90, 85):
-                opened.send(f'{{"do": "command", "name": "override", "content": {{"percent": {percent}}}}}')
+                opened.send(
+                    f'{{"do": "command", "name": "override", "content": {{"percent": {percent}}}, "seen": {10**15}}}'
+                )
             opened.send('{"do": "command", "name": "pause"}')
             until('"done","to":"pause"')
         until('"override":0.85')
         assert robot.commands == ["override", "pause", "override"]
+
+
+POINTS = "t,x,y,phi\n0,0.01,0.005,0.1\n1,0.011,0.005,0.1\n"
+MOVING: list[dict[str, Any]] = [
+    {"do": "goal", "goal": {"kind": "move", "x": 0.001, "y": 0.0, "phi": 0.0}},
+    {"do": "goal", "goal": {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}},
+    {"do": "goal", "goal": {"kind": "named", "name": "park"}},
+    {"do": "follow", "name": "path.csv", "text": POINTS},
+    *({"do": "command", "name": name} for name in ("enable", "home", "resume")),
+    {"do": "command", "name": "override", "content": {"percent": 50.0}},
+    {"do": "command", "name": "set_output", "content": {"output": "valve", "value": True}},
+]
+"""Messages that can cause motion or switch on power."""
+
+
+def replies(panel: Panel, robot: FakeRobot, messages: list[dict[str, Any]], age_ms: int) -> list[dict[str, Any]]:
+    """Send messages of a page whose newest state has an age, and STOP after them; return the replies."""
+    seen = feed.now() - age_ms
+    found: list[dict[str, Any]] = []
+    with connect(socket_of(panel), legacy=True) as opened:
+        for message in messages:
+            opened.send(msgspec.json.encode(message | {"seen": seen}).decode())
+        opened.send(msgspec.json.encode({"do": "command", "name": "stop", "seen": seen}).decode())
+        while len(found) < len(messages) + 1:
+            said = msgspec.json.decode(opened.recv(WITHIN))
+            if said["tell"] in ("refused", "done", "accepted"):
+                found.append(said)
+    return found
+
+
+@pytest.mark.parametrize("message", MOVING, ids=lambda message: str(message.get("name") or message["goal"]["kind"]))
+def test_what_can_move_the_robot_is_refused_with_words_where_the_page_is_late(message: dict[str, Any]) -> None:
+    """So is a press that a slow connection has held up. A stop is sent however late it is."""
+    robot = FakeRobot()
+    with Panel(robot.robot(), 0) as panel:
+        refused, stopped = replies(panel, robot, [message], tab_requests.MAX_STATE_AGE_MS + 1000)
+        assert (refused["tell"], refused["code"]) == ("refused", "outdated")
+        kinds = {"goal": message.get("goal", {}).get("kind"), "command": message.get("name"), "follow": "follow"}
+        assert refused["to"] == kinds[message["do"]]
+        assert "press again" in refused["message"]
+        assert (stopped["tell"], stopped["to"]) == ("done", "stop")
+        done = [*robot.commands, *robot.gone_to, *robot.moved_to, *robot.followed]
+        assert done == ["stop"]
+
+
+@pytest.mark.parametrize("name", ["disable", "stop", "quick_stop", "pause", "release", "override"])
+def test_no_stop_is_refused_however_late_it_is(name: str) -> None:
+    robot = FakeRobot()
+    content = {"content": {"percent": 0.0}} if name == "override" else {}
+    with Panel(robot.robot(), 0) as panel:
+        replies(panel, robot, [{"do": "command", "name": name} | content], 10**9)
+        assert name in robot.commands
+
+
+def test_a_jog_of_a_late_page_is_refused_once_until_the_button_is_released() -> None:
+    robot = FakeRobot()
+    robot.mode = "holding"
+    with Panel(robot.robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+        hold = {"do": "hold", "velocity": (0.01, 0.0, 0.0)}
+        for age_ms in (10**6, 10**6, 0):
+            opened.send(msgspec.json.encode(hold | {"seen": feed.now() - age_ms}).decode())
+        opened.send('{"do": "command", "name": "pause"}')
+        said: list[str] = []
+        while not said or '"tell":"done"' not in said[-1]:
+            said.append(str(opened.recv(WITHIN)))
+        assert sum('"tell":"ended"' in text and "press again" in text for text in said) == 1
+        assert robot.sent == []
+        opened.send('{"do": "release"}')
+        opened.send(msgspec.json.encode(hold | {"seen": feed.now()}).decode())
+        wait_until(lambda: bool(robot.sent), "it jogs")
 
 
 @pytest.mark.parametrize("end", ["cut off", "too large", "closed"])

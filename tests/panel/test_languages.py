@@ -63,6 +63,7 @@ def test_every_other_language_words_what_the_service_says(code: str) -> None:
     assert wanted <= set(FILES[code])
     assert {key for key in FILES[code] if key.startswith(("refusal.", "cause."))} - wanted == {
         "refusal.service",
+        "refusal.outdated",
         "refusal.unreadable",
         "cause.drive",
     }

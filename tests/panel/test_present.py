@@ -12,6 +12,7 @@ from panel.conftest import SHOWN
 from panel.fake_robot import FakeRobot
 from panel.test_page import moves, stands, typed
 from trirail.errors import RefusalCode, RefusedError
+from trirail.panel import tab_requests
 from trirail.panel.server import Panel
 from trirail.wire.state import GoalState, Pose
 from trirail.wire.vocabulary import Command, Mode
@@ -90,6 +91,31 @@ def test_a_way_is_checked_again_when_the_robot_stands_elsewhere(enabled: Page, r
     robot.pose = (0.22, 0.0, 0.0)
     enabled.until("document.querySelector('#going').dataset.may === 'no'")
     assert "on the way" in enabled.text("#going-says")
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_what_is_pressed_on_a_page_that_is_late_is_refused_in_words(
+    enabled: Page, robot: FakeRobot, language: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.lasting = True
+    typed(enabled, "1", "2", "3")
+    enabled.click("#go")
+    wait_until(lambda: robot.mode == "moving", "it goes")
+    robot.mode = "holding"  # paused
+    enabled.until("!document.querySelector('[data-command=resume]').disabled")
+    enabled.choose("#language", language)
+    enabled.until(f"document.documentElement.lang === {language!r}")
+    monkeypatch.setattr(tab_requests, "MAX_STATE_AGE_MS", -1)
+    before, why = robot.pose, {"en": "the page showed no state", "de": "die Anzeige war nicht aktuell"}[language]
+    enabled.click("[data-step='1']")
+    for selector in (RIGHT, "#go", "[data-pose=park]", "[data-command=resume]"):
+        enabled.evaluate("document.querySelector('#answer').textContent = ''")
+        enabled.click(selector)
+        enabled.until(f"{ANSWER}.includes({why!r})")
+    enabled.click("#stop")
+    wait_until(lambda: "stop" in robot.commands, "a stop")
+    assert (robot.pose, robot.gone_to, robot.commands) == (before, [], ["enable", "stop"])
+    enabled.evaluate("localStorage.clear()")
 
 
 # ---------------------------------------------------------------------- what cannot work

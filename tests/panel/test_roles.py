@@ -29,15 +29,22 @@ MAY: dict[Role | None, set[str]] = {
 """Once more, by hand."""
 PATH = "t,x,y,phi\n0,0.01,0.005,0.1\n1,0.011,0.005,0.1\n"
 ACTIONS: list[tuple[str, dict[str, Any]]] = [
-    *((name, {"do": "command", "name": name}) for name in Command if name.content not in (Override, SetOutput)),
-    ("override", {"do": "command", "name": "override", "content": {"percent": 50.0}}),
-    ("set_output", {"do": "command", "name": "set_output", "content": {"output": "valve", "value": True}}),
+    *(
+        (name, {"do": "command", "name": name, "seen": 10**15})
+        for name in Command
+        if name.content not in (Override, SetOutput)
+    ),
+    ("override", {"do": "command", "name": "override", "content": {"percent": 50.0}, "seen": 10**15}),
+    (
+        "set_output",
+        {"do": "command", "name": "set_output", "content": {"output": "valve", "value": True}, "seen": 10**15},
+    ),
     ("takeover", {"do": "takeover"}),
     ("goal", {"do": "hold", "velocity": [0.01, 0.0, 0.0], "seen": 10**15}),
     ("goal", {"do": "goal", "goal": {"kind": "move", "x": 0.001, "y": 0.0, "phi": 0.0}, "seen": 10**15}),
-    ("goal", {"do": "goal", "goal": {"kind": "named", "name": "park"}}),
-    ("goal", {"do": "goal", "goal": {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}}),
-    ("goal", {"do": "follow", "name": "path.csv", "text": PATH}),
+    ("goal", {"do": "goal", "goal": {"kind": "named", "name": "park"}, "seen": 10**15}),
+    ("goal", {"do": "goal", "goal": {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}, "seen": 10**15}),
+    ("goal", {"do": "follow", "name": "path.csv", "text": PATH, "seen": 10**15}),
     ("poses", {"do": "teach", "name": "here"}),
     ("poses", {"do": "forget", "name": "park"}),
 ]

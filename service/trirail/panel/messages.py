@@ -5,16 +5,20 @@ In the other direction, the server sends State, Event and other messages, with t
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated, ClassVar
 
 from msgspec import Meta, Raw, Struct
 
 from trirail.panel.permissions import GOAL, POSES, TAKEOVER
+from trirail.wire.decoding import INVALID, decoded
 from trirail.wire.goal_kind import FrameName
 from trirail.wire.goals import Coordinates, MoveGoal, NamedGoal, PoseGoal
 from trirail.wire.sizes import MAX_FILE
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, Override
 
+MOVING_COMMANDS = frozenset({Command.ENABLE, Command.HOME, Command.RESUME, Command.OVERRIDE, Command.SET_OUTPUT})
+"""Commands that can cause motion or switch on power."""
 Content = Annotated[str, Meta(max_length=MAX_FILE)]
 """Content of a trajectory file."""
 
@@ -46,7 +50,7 @@ class JogHeld(_PageMessage, frozen=True, tag="hold"):
     velocity: Coordinates
     """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
     seen: int
-    """Stamp of the newest state that the page has drawn. The server ignores the message if this state is outdated."""
+    """Stamp of the newest state that the page has drawn. The server refuses the jog if this state is outdated."""
     tool: FrameName | None = None
     """Name of the tool in [frames.tool] about which the platform turns; None for the platform's centre."""
 
@@ -62,6 +66,17 @@ class SendCommand(_PageMessage, frozen=True, tag="command"):
     """Name of the command."""
     content: Raw = Raw()
     """Content of the command, which the server forwards unchanged."""
+    seen: int = 0
+    """Stamp of the newest state that the page has drawn."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether the command can cause motion or switch on power. The override 0 only stops the robot."""
+        if self.name is Command.OVERRIDE:
+            with contextlib.suppress(*INVALID):  # the service refuses invalid content
+                override: Override = decoded(bytes(self.content), Override)
+                return override.percent > 0.0
+        return self.name in MOVING_COMMANDS
 
     @property
     def required_permission(self) -> str:
@@ -82,8 +97,8 @@ class SendGoal(_PageMessage, frozen=True, tag="goal"):
 
     goal: PoseGoal | NamedGoal | MoveGoal
     """Goal, which the server forwards unchanged."""
-    seen: int | None = None
-    """Stamp of the newest state that the page has drawn, if the goal is relative to this state; otherwise None."""
+    seen: int
+    """Stamp of the newest state that the page has drawn. The server refuses the goal if this state is outdated."""
 
 
 class CheckPose(_PageMessage, frozen=True, tag="check"):
@@ -117,6 +132,8 @@ class Follow(_PageMessage, frozen=True, tag="follow"):
     """Name of the file, as in CheckPath."""
     text: Content
     """Content of the file."""
+    seen: int
+    """Stamp of the newest state that the page has drawn. The server refuses the path if this state is outdated."""
     stretch: bool = False
     """Whether to slow down a path that is too fast."""
 

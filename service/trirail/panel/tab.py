@@ -16,9 +16,9 @@ from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import GoalHandle, LoopThread
 from trirail.client.held_jog import HeldJog
 from trirail.errors import RefusalCode
-from trirail.panel.feed import Feed, now
+from trirail.panel.feed import Feed
 from trirail.panel.messages import AnyPageMessage, CheckPath, CheckPose, JogHeld, JogReleased, SendCommand, StateDrawn
-from trirail.panel.tab_requests import MAX_STATE_AGE_MS, TabRequests, refusal
+from trirail.panel.tab_requests import OUTDATED, TabRequests, is_fresh, refusal
 from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.goals import Goal
 
@@ -84,6 +84,8 @@ class Tab:
         self._robot = robot
         self._loop = loop
         self._jog = HeldJog(self._send_goal, self._on_jog_ended)
+        self._jog_refused = False
+        """Whether a jog was refused because of an outdated state. It stays refused until the button is released."""
         self._outbox: deque[bytes] = deque(maxlen=MAX_ANSWERS)
         self._undrawn: deque[int] = deque()
         self._requests = TabRequests(robot, loop, self._enqueue)
@@ -126,9 +128,13 @@ class Tab:
                         self._undrawn.popleft()
                     self._feed.changed.notify_all()
             case JogHeld(velocity, seen, tool):
-                if now() - seen <= MAX_STATE_AGE_MS:
+                if not is_fresh(seen) and not self._jog_refused:
+                    self._jog_refused = True
+                    self._enqueue("ended", **OUTDATED)
+                if not self._jog_refused:
                     self._jog.hold(velocity, tool)
             case JogReleased():
+                self._jog_refused = False
                 self._jog.release()
             case CheckPose():
                 self._poses.submit(lambda: self._check_pose(message))

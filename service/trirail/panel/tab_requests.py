@@ -22,9 +22,9 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import Command
 
 MAX_STATE_AGE_MS = 500
-"""Maximum age of the newest state on the page at which the page can jog [ms].
+"""Maximum age of the newest state on the page at which the page can move the robot [ms].
 
-If the state is older, the page or its connection has stalled."""
+If the state is older, the page or its connection has stalled, and the operator pressed the button some time ago."""
 MAX_PENDING = 8
 """Maximum number of unanswered requests of a tab.
 
@@ -70,27 +70,33 @@ class TabRequests:
     def begin(self, request: ServiceRequest) -> None:
         """Send a request in parallel with pending requests.
 
-        Ignore a command that is already pending, and a goal that refers to an outdated state. Of the overrides that are
-        requested while another override is pending, only the newest is sent.
+        Ignore a command that is already pending. Refuse what can cause motion or power if the page's state is outdated.
+        Of the overrides that are requested while another override is pending, only the newest is sent.
         """
         match request:
-            case SendCommand(Command.OVERRIDE, content):
+            case SendCommand(Command.OVERRIDE, content) if not request.moves or is_fresh(request.seen):
                 self._loop.start(self._set_override(bytes(content) or None))
-            case SendCommand(name, content):
+            case SendCommand(name, content) if not request.moves or is_fresh(request.seen):
                 send = lambda: self._command(name, bytes(content) or None)  # noqa: E731
                 self._loop.start(self._answer(send, name))
+            case SendCommand(name):
+                self._reply("refused", to=name, name="", **OUTDATED)
             case TakeOver():
                 self._loop.start(self._answer(lambda: self._acquire(force=True), "takeover"))
             case SendGoal(goal, seen):
-                if seen is None or now() - seen <= MAX_STATE_AGE_MS:
-                    name = str(getattr(goal, "name", ""))
-                    self._loop.start(self._answer(lambda: self._robot.send(goal), kind_name(goal), name))
-            case Follow(name):
-                self._loop.start(self._answer(lambda: self._follow(request), "follow", name))
+                self._begin_motion(lambda: self._robot.send(goal), seen, kind_name(goal), getattr(goal, "name", ""))
+            case Follow(name, _, seen):
+                self._begin_motion(lambda: self._follow(request), seen, "follow", name)
             case Teach(name):
                 self._loop.start(self._answer(lambda: self._robot.teach(name), "teach", name))
             case Forget(name):
                 self._loop.start(self._answer(lambda: self._robot.forget(name), "forget", name))
+
+    def _begin_motion(self, send: Callable[[], Awaitable[AsyncGoalHandle]], seen: int, kind: str, name: str) -> None:
+        if is_fresh(seen):
+            self._loop.start(self._answer(send, kind, name))
+        else:
+            self._reply("refused", to=kind, name=name, **OUTDATED)
 
     async def _answer(self, send_request: Callable[[], Awaitable[object]], kind: str, name: str = "") -> None:
         """Send a request, and send its result to the page.
@@ -156,6 +162,18 @@ class TabRequests:
         lease, self._lease = self._lease, None
         if lease is not None:
             await lease.__aexit__()
+
+
+OUTDATED = {
+    "code": "outdated",
+    "message": f"the page showed no state of the last {MAX_STATE_AGE_MS / 1e3:g} s, so nothing was sent; press again",
+}
+"""Fields of a message that refuses a request because the page or its connection has stalled."""
+
+
+def is_fresh(seen: int) -> bool:
+    """Return whether the state with the stamp `seen` is new enough for a request that moves the robot."""
+    return now() - seen <= MAX_STATE_AGE_MS
 
 
 def refusal(error: TrirailError) -> dict[str, Any]:

@@ -11,10 +11,10 @@ const STEPS = 4; // beside jogging while a button is held
 const byId = (id) => document.getElementById(id);
 
 export class Jogging {
-  // `send` says a message to the server; `now()` is the robot, where it stands and the stamp of the newest state drawn.
+  // `send` says a message to the server; `now()` is the robot and where it stands.
   constructor(send, now, answer, barred, stop) {
     this.now = now;
-    const sign = (direction) => this.step === 0 && send({ do: "hold", velocity: this.#velocity(direction), seen: now().seen, tool: byId("tool").value || null });
+    const sign = (direction) => this.step === 0 && send({ do: "hold", velocity: this.#velocity(direction), tool: byId("tool").value || null });
     const release = () => send({ do: "release" });
     this.step = 0; // which of the robot's steps is chosen, from 1; 0: a button moves while it is held
     this.hold = new Hold(
@@ -25,7 +25,7 @@ export class Jogging {
         if (this.step === 0) return;
         const by = { x: 0, y: 0, phi: 0, [axis]: Number(sign) * (axis === "phi" ? this.#angle(this.step) * DEGREE : this.#length(this.step)) };
         answer(say("do.move"));
-        send({ do: "goal", goal: { kind: "move", ...by, speed: this.speed, tool: byId("tool").value || null, frame: byId("along").value }, seen: now().seen });
+        send({ do: "goal", goal: { kind: "move", ...by, speed: this.speed, tool: byId("tool").value || null, frame: byId("along").value } });
       },
       (button) => barred(button.title),
     );

@@ -17,6 +17,7 @@ import { refusal } from "./service_words.js";
 import { onLanguage, say } from "./words.js";
 
 const LEASED = { acquire: true, takeover: true, release: false }; // commands that take or give back the lease
+const SEEN = ["hold", "goal", "follow", "command"]; // messages that carry the stamp of the newest state that was drawn
 const SILENT = 1500; // without a state for so long, what is shown is old [ms]
 const AGAIN = 500; // after so long a lost connection is tried again [ms]
 
@@ -33,7 +34,7 @@ let seen = 0; // the stamp of the newest state that was drawn
 let drawn = true;
 let heard = 0;
 
-const now = () => ({ robot, drawing, seen, state: contact ? state : null, pose: contact ? state.pose : null });
+const now = () => ({ robot, drawing, state: contact ? state : null, pose: contact ? state.pose : null });
 const line = new Answer(byId("answer"));
 const answer = (what) => line.asked(what);
 const note = (words) => (words ? line.refused(words) : line.clear());
@@ -52,8 +53,10 @@ const sessions = new Sessions(now);
 
 // ------------------------------------------------------------------ to the server
 
+// What can move the robot carries the stamp of the state that the operator saw: the server refuses it where that is old.
 function send(message) {
-  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+  const whole = SEEN.includes(message.do) ? { ...message, seen } : message;
+  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(whole));
   else if (socket) note(say("not_sent"));
 }
 
