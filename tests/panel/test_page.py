@@ -421,6 +421,25 @@ def test_a_pose_is_dragged_on_the_drawing_and_moves_nothing_before_it_is_told(en
     assert robot.pose == pytest.approx((before[0] + 0.02, before[1] + 0.01, before[2]), abs=1e-6)
 
 
+def test_a_pose_is_turned_through_any_angle_without_a_jump(enabled: Page, robot: FakeRobot) -> None:
+    """With Shift, around the platform: also past the direction at which the angle of the pointer changes its sign."""
+    a, e, f = enabled.evaluate("(({a, e, f}) => [a, e, f])(document.querySelector('#mechanism').getScreenCTM())")
+    x, y, phi = robot.pose
+    shown = "document.querySelector('#to-phi').value"
+
+    def move(kind: str, degrees: float) -> None:
+        along = math.radians(degrees)
+        at = {"x": a * (x + 0.1 * math.cos(along)) + e, "y": -a * (y + 0.1 * math.sin(along)) + f}
+        enabled._mouse(kind, at | {"modifiers": 8})
+
+    move("mousePressed", 178.0)
+    for degrees in (*range(180, 400, 20), *range(400, 150, -20)):
+        move("mouseMoved", degrees)
+        enabled.until(f"Math.abs({shown} - {math.degrees(phi) + degrees - 178.0}) < 0.5")
+    move("mouseReleased", 160.0)
+    assert robot.pose == (x, y, phi)
+
+
 @pytest.mark.usefixtures("slow_hand")
 @pytest.mark.parametrize(
     ("button", "by"),

@@ -121,14 +121,21 @@ export class Going {
     if (event.button !== 0 || !from || !drawing || !robot?.permissions.includes("goal")) return;
     event.preventDefault();
     byId("mechanism").setPointerCapture(event.pointerId);
-    this.grabbed = { from, at: drawing.place(event) };
+    const at = drawing.place(event);
+    this.grabbed = { from, at, angle: angle(from, at), turned: 0 };
   }
 
   #drag(event) {
     if (!this.grabbed) return;
     const { from, at } = this.grabbed;
-    const [x, y] = this.now().drawing.place(event);
-    if (event.shiftKey) this.choose([from[0], from[1], from[2] + Math.atan2(y - from[1], x - from[0]) - Math.atan2(at[1] - from[1], at[0] - from[0])]);
-    else this.choose([from[0] + x - at[0], from[1] + y - at[1], from[2]]);
+    const pointer = this.now().drawing.place(event);
+    if (!event.shiftKey) return this.choose([from[0] + pointer[0] - at[0], from[1] + pointer[1] - at[1], from[2]]);
+    const more = angle(from, pointer) - this.grabbed.angle; // around the other side where it passes 180°
+    this.grabbed.turned += more - 2 * Math.PI * Math.round(more / (2 * Math.PI));
+    this.grabbed.angle = angle(from, pointer);
+    this.choose([from[0], from[1], from[2] + this.grabbed.turned]);
   }
 }
+
+// The direction of a point from a pose's place.
+const angle = ([x, y], [px, py]) => Math.atan2(py - y, px - x);
