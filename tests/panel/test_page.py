@@ -553,6 +553,34 @@ def test_events_come_with_their_time_the_past_too(page: Page, robot: FakeRobot) 
     page.until_equal("document.querySelector('#events li').className", "warning")
 
 
+def test_events_are_shown_once_and_in_order_whatever_is_started_again(browser: Page, robot: FakeRobot) -> None:
+    """So on a new connection of the tab, and after a service whose clock was set back."""
+    shown = "[...document.querySelectorAll('#events li')].map((each) => each.event.message)"
+    runs = [(run, seq) for run, most in (("a", 4), ("b", 2)) for seq in range(1, most + 1)]
+    look = {"id": "align-1", "purpose": "alignment", "number": 1, "end": "missing"}
+    with Panel(robot.robot(), 0) as panel:
+        script = panel._files["panel.js"]
+        panel._files["panel.js"] = script.replace(
+            b"socket = new WebSocket", b"globalThis.opened = socket = new WebSocket"
+        )
+        page = browser.another()
+        page.open(panel.url)
+        page.until(SHOWN)
+        for run, seq in runs:
+            more: dict[str, Any] = (
+                {"alignment": look, "kind": "alignment", "user": "bob"} if (run, seq) == ("a", 4) else {}
+            )
+            robot.say(f"{run} {seq}", run=run, seq=seq, time={"a": 1.7e9, "b": 1.6e9}[run] + seq, **more)
+        wanted = ["b 2", "b 1", "a 4", "a 3", "a 2", "a 1", "the loop turns at 1000 Hz"]
+        page.until_equal(shown, wanted)
+        page.evaluate("(() => { globalThis.before = opened; opened.close(); })()")
+        page.until("opened !== before && document.body.dataset.contact === 'yes'")
+        robot.say("b 3", run="b", seq=3)
+        page.until(f"{shown}[0] === 'b 3'")
+        page.until_equal(shown, ["b 3", *wanted])
+        page.close()
+
+
 def test_nothing_is_loaded_from_elsewhere_and_nothing_fails(page: Page, panel: Panel) -> None:
     loaded = page.evaluate("performance.getEntriesByType('resource').map((each) => [each.name, each.responseStatus])")
     assert {name.removeprefix(panel.url) for name, _ in loaded} >= {"panel.js", "hold.js", "drawing.js", "panel.css"}

@@ -11,16 +11,14 @@ export class Alignment {
     this.section = section;
     this.button = button;
     this.looks = [];
-    this.newest = [0, 0];
     this.user = "";
     this.time = 0;
     onLanguage(() => this.show());
     this.show();
   }
 
-  event({ alignment: look, user, seq, time }) {
-    if (!look || (seq <= this.newest[0] && time <= this.newest[1])) return; // told again, on a new connection
-    this.newest = [seq, time];
+  event({ alignment: look, user, time }) {
+    if (!look) return;
     const first = this.looks[0];
     if (first && (first.id !== look.id || first.purpose !== look.purpose)) this.looks = [];
     this.looks = [...this.looks, look].slice(-KEPT);

@@ -8,7 +8,7 @@ const KEPT = 200; // so many lines are shown
 export class Events {
   constructor(list) {
     this.list = list;
-    this.rank = [0, 0];
+    this.newest = new Map(); // the number of the newest event, of each run of the service
     this.mode = "";
     this.goalEnded = -1; // in which cycle
     this.faults = new Map(); // the events of faults, by their messages
@@ -17,12 +17,13 @@ export class Events {
     });
   }
 
+  // Show an event; return false for one that is told again, on a new connection.
   add(event) {
-    const { seq, time: at, kind, message } = event;
-    if (seq <= this.rank[0] && at <= this.rank[1]) return; // told again, on a new connection
-    this.rank = [seq, at];
+    const { seq, run = "", kind, message } = event;
+    if (seq <= this.newest.get(run)) return false;
+    this.newest.set(run, seq);
     if (kind === "fault") this.faults.set(message, event);
-    if (this.#isPartOfGoal(event)) return;
+    if (this.#isPartOfGoal(event)) return true;
     const goal = kind === "goal" ? event.id : kind === "mode" ? event.goal : undefined;
     if (goal) [...this.list.children].find((each) => each.dataset.goal === goal)?.remove();
     const item = document.createElement("li");
@@ -31,6 +32,7 @@ export class Events {
     fill(item);
     this.list.prepend(item);
     while (this.list.childElementCount > KEPT) this.list.lastChild.remove();
+    return true;
   }
 
   // Whether a mode follows from a goal's end, which has its line.

@@ -101,9 +101,8 @@ const takes = {
     drawn = false;
   },
   event({ event }) {
-    events.add(event);
+    if (events.add(event)) alignment.event(event);
     line.event(event);
-    alignment.event(event);
     commands.event(event);
     outputs.event(event, drawing);
   },
