@@ -9,6 +9,7 @@ import signal
 import time
 from typing import Any
 
+import msgspec
 import pytest
 from chromium import Page, needs_chromium
 from panel.conftest import SHOWN
@@ -16,6 +17,7 @@ from panel.fake_robot import FakeRobot
 from trirail.client.held_jog import TIMEOUT
 from trirail.errors import RefusalCode, RefusedError
 from trirail.panel.server import Panel
+from trirail.wire.state import Info
 from waiting import wait_until
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
@@ -360,6 +362,46 @@ def test_the_last_minutes_are_drawn_and_a_silent_time_is_a_gap(enabled: Page, ro
     robot.silent.set()
     enabled.until("document.querySelector('#mode-name').textContent === 'no contact'")
     assert drawn_so_far()[-1] == [None] * 7
+    robot.silent.clear()
+
+
+CHARTS = "(await import('./panel.js')).charts"
+
+
+def test_curves_begin_anew_after_a_clock_that_was_set_back(page: Page) -> None:
+    def times() -> list[float]:
+        found: list[float] = page.evaluate(f"(async () => {CHARTS}.times)()")
+        return found
+
+    wait_until(lambda: len(times()) > 3, "curves")
+    page.evaluate("(() => { const clock = Date.now; Date.now = () => clock() - 3_600_000; })()")
+    before = times()[0]
+    wait_until(lambda: times()[0] < before - 3000.0 and len(times()) > 3, "curves of now")
+    found = times()
+    assert found == sorted(found)
+
+
+def test_curves_in_another_unit_are_cleared(page: Page, robot: FakeRobot) -> None:
+    wait_until(lambda: page.evaluate(f"(async () => {CHARTS}.rows.length)()") > 3, "curves")
+    restart(page, robot, small(robot.told))
+    page.until(f"{SHOWN} && document.querySelector('#to-x').placeholder === 'µm'")
+    wait_until(lambda: page.evaluate(f"(async () => {CHARTS}.rows.length)()") > 3, "curves")
+    rows = page.evaluate(f"(async () => {CHARTS}.rows)()")
+    assert [row[0] for row in rows] == pytest.approx([robot.pose[0] * 1e6] * len(rows))
+
+
+def small(info: Info) -> Info:
+    """The same robot with so little travel that it is shown in micrometres."""
+    limits = msgspec.to_builtins(info.limits)
+    limits["platform"]["x"] = [-0.01, 0.01]
+    return msgspec.structs.replace(info, limits=limits)
+
+
+def restart(page: Page, robot: FakeRobot, info: Info) -> None:
+    """Start the service again with another configuration."""
+    robot.silent.set()
+    page.until("document.body.dataset.contact === 'none'")
+    robot.told = info
     robot.silent.clear()
 
 

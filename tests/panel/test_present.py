@@ -10,7 +10,7 @@ import pytest
 from chromium import Page, needs_chromium
 from panel.conftest import SHOWN
 from panel.fake_robot import FakeRobot
-from panel.test_page import moves, stands, typed
+from panel.test_page import moves, small, stands, typed
 from trirail.errors import RefusalCode, RefusedError
 from trirail.panel import tab_requests
 from trirail.panel.server import Panel
@@ -309,14 +309,8 @@ def test_a_pose_keeps_its_place_while_others_come_and_go(page: Page, robot: Fake
 # ---------------------------------------------------------------------- a stage, and German
 
 
-def small(robot: FakeRobot) -> None:
-    limits = msgspec.to_builtins(robot.told.limits)
-    limits["platform"]["x"] = [-0.01, 0.01]
-    robot.told = msgspec.structs.replace(robot.told, limits=limits)
-
-
 def test_a_stage_is_shown_in_micrometres_and_gone_to_in_them(browser: Page, robot: FakeRobot) -> None:
-    small(robot)
+    robot.told = small(robot.told)
     robot.mode, robot.pose = "holding", (1.2345e-3, 0.0, 0.0)
     with Panel(robot.robot(), 0) as panel:
         page = browser.another()

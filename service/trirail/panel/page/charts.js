@@ -18,15 +18,20 @@ const style = (name) => getComputedStyle(document.documentElement).getPropertyVa
 
 export class Charts {
   constructor() {
-    this.times = [];
-    this.rows = []; // x, y in the unit of the page, φ [°], following error of each slider [µm], lateness [µs]
+    this.clear();
     this.last = -Infinity;
     this.drawn = -Infinity;
     this.plots = [];
   }
 
+  clear() {
+    this.times = [];
+    this.rows = []; // x, y in the unit of the page, φ [°], following error of each slider [µm], lateness [µs]
+  }
+
   // Draw anew, for this robot and in the language of now.
   robot({ sliders, colours, resolution }) {
+    if (this.scale !== resolution.scale) this.clear(); // they are in another unit
     this.scale = resolution.scale;
     for (const plot of this.plots) plot.destroy();
     const [x, y, phi] = ["--accent", "--second", "--third"].map(style);
@@ -41,12 +46,7 @@ export class Charts {
   state({ pose, sliders, loop }, now) {
     if (now - this.last < EVERY) return;
     this.last = now;
-    this.times.push(Date.now() / 1e3);
-    this.rows.push([pose[0] * this.scale, pose[1] * this.scale, pose[2] * PHI, ...sliders.following_error.map((each) => each * 1e6), loop.lateness_us.p99]);
-    while (this.times[this.times.length - 1] - this.times[0] > KEPT) {
-      this.times.shift();
-      this.rows.shift();
-    }
+    this.#add([pose[0] * this.scale, pose[1] * this.scale, pose[2] * PHI, ...sliders.following_error.map((each) => each * 1e6), loop.lateness_us.p99]);
     if (now - this.drawn < DRAWN || byId("charts").hidden) return;
     this.drawn = now;
     this.draw();
@@ -55,8 +55,19 @@ export class Charts {
   // A time without contact is a gap.
   lost() {
     if (!this.rows.length || this.rows.at(-1)[0] === null) return;
-    this.times.push(Date.now() / 1e3);
-    this.rows.push(Array(7).fill(null));
+    this.#add(Array(7).fill(null));
+  }
+
+  // What is drawn must be in order of time: after a clock that was set back the curves begin anew.
+  #add(row) {
+    const at = Date.now() / 1e3;
+    if (at < this.times.at(-1)) this.clear();
+    this.times.push(at);
+    this.rows.push(row);
+    while (at - this.times[0] > KEPT) {
+      this.times.shift();
+      this.rows.shift();
+    }
   }
 
   draw() {
