@@ -53,8 +53,8 @@ Object.defineProperty(globalThis, "navigator", { value: { languages: [process.ar
 const languages = { de: "Deutsch", en: "English" };
 const file = (name) => (name === "languages.json" ? languages : read(`${process.argv[2]}/${name}`));
 globalThis.fetch = async (name) => ({ json: async () => file(name) });
-const { event } = await import("./service_words.js");
-const shown = read(0).map((each) => event(each));
+const { event, obstacle } = await import("./service_words.js");
+const shown = read(0).map((each) => (each.kind ? event(each) : obstacle(each)));
 console.log(JSON.stringify(shown.map(({ textContent, title = null }) => [textContent, title])));
 """
 
@@ -185,3 +185,32 @@ def test_an_event_without_a_known_code_is_in_the_service_s_words(folder: Path, c
 def test_english_is_the_service_s_own_sentence(folder: Path) -> None:
     found = shown(folder, [event(code, values(code, 0), kind=kind) for code in CODES for kind in kinds()], "en")
     assert set(found) == {(ENGLISH, None)}
+
+
+@pytest.mark.parametrize(
+    ("beyond", "unit", "value", "limit"),
+    [
+        (1e-2, "m", "160,00 mm", "150,00 mm"),
+        (3e-6, "m", "150,003 mm", "150,000 mm"),
+        (1e-9, "m", "150,000001 mm", "150,000000 mm"),
+        (0.0, "m", "150,00 mm", "150,00 mm"),
+        (1e-6, "rad", "8,59442°", "8,59437°"),
+        (1e-5, "m/s", "0,15001 m/s", "0,15 m/s"),
+    ],
+)
+def test_a_value_and_its_limit_are_shown_with_so_many_decimals_that_they_differ(
+    folder: Path, beyond: float, unit: str, value: str, limit: str
+) -> None:
+    values = {"value": 0.15 + beyond, "limit": 0.15, "unit": unit}
+    place = {"part": "platform", "name": "x", "quantity": "position"}
+    told = {"message": ENGLISH, "user": "ann", "seq": 1, "time": 1.7e9}
+    events = [
+        {"kind": "warning", "event_code": EventCode.OUTSIDE_LIMITS, "params": place | values} | told,
+        {"code": "platform_position", "what": "x", "message": ENGLISH} | values,
+    ]
+    if unit == "m":
+        refused = {"kind": "refused", "code": RefusalCode.OUT_OF_WORKSPACE, "slider": "A"}
+        events.append(refused | values | told)
+    for text, _ in shown(folder, events):
+        assert f" {value}" in text
+        assert f" {limit}" in text

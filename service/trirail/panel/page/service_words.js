@@ -1,7 +1,7 @@
 // What the service says, in the language of the page: by its codes, with their values. The service's own sentence,
 // which is English, stands where the language has no words for a code, and is shown on hover where it has.
 
-import { angle, length, rounded } from "./units.js";
+import { angle, apart, length } from "./units.js";
 import { has, number, quoted, say } from "./words.js";
 
 // A refusal, or how a jog ended: {code, message, slider, value, limit}.
@@ -11,9 +11,8 @@ export function refusal(told) {
 
 // What is in the way of a pose: {message, code, what, value, limit, unit}.
 export function obstacle(told) {
-  const shown = (value) => (told.unit === "m" ? length(value) : `${number((value * 180) / Math.PI, 2)}°`);
-  const values = { what: told.what, value: shown(told.value ?? 0), limit: shown(told.limit ?? 0) };
-  return worded(`obstacle.${told.code}`, values, told.message);
+  const [value, limit] = apart(told.value ?? 0, told.limit ?? 0, told.unit || "rad");
+  return worded(`obstacle.${told.code}`, { what: told.what, value, limit }, told.message);
 }
 
 // A reason why the robot is in fault, with the event that told it, if one did.
@@ -33,7 +32,7 @@ export function event(told) {
 // How values of events are shown, by their names; others as numbers, or as they are.
 const metres = (value) => length(value);
 const seconds = (value) => `${number(value, 0, 3)} s`;
-const limited = (value, { unit = "m" }) => (unit === "m" ? length(value) : unit === "rad" ? angle(value) : `${rounded(value)} ${unit}`);
+const limited = ({ value, limit = value, unit = "m" }) => apart(value ?? limit, limit, unit);
 const word = (value) => say(`word.${value.replaceAll(" ", "_")}`, {}, value);
 const alignment = (value) => say(`alignment.${value}`, {}, value);
 const SHOWN = {
@@ -50,8 +49,8 @@ const SHOWN = {
   position: metres,
   position_before: metres,
   on: (value) => say(value ? "input.on" : "input.off"),
-  value: limited,
-  limit: limited,
+  value: (_, params) => limited(params)[0],
+  limit: (_, params) => limited(params)[1],
   settle: (value) => `${number(value * 1e3, 0, 3)} ms`,
   timeout: seconds,
   silence: seconds,
@@ -77,7 +76,8 @@ function cause(name, { drive = "", code = 0 }) {
 // The slider, its value and its limit; empty where the refusal names none.
 function bound({ slider, value, limit, code }) {
   if (code !== "out_of_workspace" || !slider || value == null || limit == null || !has("bound.slider")) return "";
-  return say("bound.slider", { slider, value: length(value), limit: length(limit) });
+  const [shown, bound] = apart(value, limit, "m");
+  return say("bound.slider", { slider, value: shown, limit: bound });
 }
 
 function worded(key, values, message) {

@@ -4,6 +4,8 @@ import { number } from "./words.js";
 
 export const DEGREE = Math.PI / 180;
 
+const MORE = 9; // so many decimals are added at most
+
 let resolution = { unit: "mm", scale: 1e3, decimals: 2, angle_decimals: 3 };
 
 export function useResolution(found) {
@@ -21,10 +23,19 @@ export const length = (metres, decimals = resolution.decimals) => `${number(metr
 
 export const velocity = (metresPerSecond) => `${number(metresPerSecond * resolution.scale, resolution.decimals - 1)} ${resolution.unit}/s`;
 
-export const angle = (radians) => `${number(radians / DEGREE, resolution.angle_decimals)}°`;
+export const angle = (radians, decimals = resolution.angle_decimals) => `${number(radians / DEGREE, decimals)}°`;
 
 // A value with three digits, as of speeds.
-export const rounded = (value) => number(Number(value.toPrecision(3)), 0, 6);
+export const rounded = (value, digits = 3) => number(Number(value.toPrecision(digits)), 0, 12);
+
+// A value and its limit, `unit` "m", "rad" or another: with so many decimals that they differ where the values do.
+export function apart(value, limit, unit) {
+  const shown = (each, more) =>
+    unit === "m" ? length(each, resolution.decimals + more) : unit === "rad" ? angle(each, resolution.angle_decimals + more) : `${rounded(each, 3 + more)} ${unit}`;
+  let more = 0;
+  while (more < MORE && value !== limit && shown(value, more) === shown(limit, more)) more++;
+  return [shown(value, more), shown(limit, more)];
+}
 
 // A jog step [m] in the unit that keeps it short.
 export function step(metres) {
