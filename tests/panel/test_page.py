@@ -441,6 +441,34 @@ def test_what_is_in_the_way_is_said_before_anything_moves(enabled: Page) -> None
     enabled.until_equal("document.querySelector('.wanted').parentElement.getAttribute('class')", "barred")
 
 
+@pytest.mark.parametrize("changed", ["unit", "frame", "its place", "tool"])
+def test_numbers_that_would_mean_another_place_after_a_restart_are_cleared(
+    changed: str, enabled: Page, robot: FakeRobot
+) -> None:
+    frames: dict[str, Any] = {"tool": {"tip": (0.02, 0.0)}, "work": {"table": (0.05, 0.02, 0.0)}}
+    known = msgspec.structs.replace(robot.told, frames=frames)
+    restart(enabled, robot, known)
+    enabled.until(f"{SHOWN} && document.querySelector('#frame').options.length === 2")
+    enabled.choose("#frame", "table")
+    enabled.choose("#tool", "tip")
+    typed(enabled, "20", "0", "0")
+    restart(enabled, robot, known)
+    enabled.until(f"{SHOWN} && document.querySelector('#going').dataset.may === 'yes'")
+    other: dict[str, dict[str, Any]] = {
+        "frame": frames | {"work": {}},
+        "its place": frames | {"work": {"table": (0.06, 0.02, 0.0)}},
+        "tool": frames | {"tool": {}},
+    }
+    info = small(known) if changed == "unit" else msgspec.structs.replace(known, frames=other[changed])
+    restart(enabled, robot, info)
+    enabled.until(f"{SHOWN} && document.querySelector('#to-x').value === ''")
+    before = robot.pose
+    enabled.click("#go")
+    enabled.until_equal("document.activeElement.id", "to-x")
+    assert robot.pose == before
+    enabled.until_equal("document.querySelector('#to-x').placeholder", "µm" if changed == "unit" else "mm")
+
+
 @pytest.mark.parametrize("word", ["ten", "10 furlongs", "1.2.3", "1e3", "--5", "5 mm mm"])
 def test_what_is_no_number_is_said_and_goes_nowhere(word: str, enabled: Page, robot: FakeRobot) -> None:
     before = robot.pose

@@ -31,6 +31,7 @@ export class Going {
     this.number = 0;
     this.from = null; // where the robot stood when that was checked, and when that was
     this.pose = null; // what is chosen, if it is a pose: of the tool, in the frame
+    this.meaning = ""; // the unit, tool and frame of what is typed
     this.fields.forEach((field) => field.addEventListener("input", () => this.#typed()));
     byId("going").addEventListener("submit", (event) => {
       event.preventDefault();
@@ -51,6 +52,8 @@ export class Going {
     const { robot } = this.now();
     if (robot) offer(byId("frame"), [["base", say("frame.base")], ...Object.keys(robot.frames).map((name) => [name, name])]);
     this.fields.slice(0, 2).forEach((field) => { field.placeholder = unit(); });
+    // The same numbers would be another place, after a restart with another configuration.
+    if (this.meaning !== this.#meaning) this.fields.forEach((field) => { field.value = ""; });
     this.#typed();
   }
 
@@ -83,6 +86,10 @@ export class Going {
     this.send({ do: "check", goal: this.#goal, number: ++this.number });
   }
 
+  get #meaning() {
+    return JSON.stringify([unit(), byId("tool").value, this.#tool, byId("frame").value, this.#frame]);
+  }
+
   get #tool() {
     return this.now().robot?.tools[byId("tool").value] ?? NO_TOOL;
   }
@@ -97,6 +104,7 @@ export class Going {
   }
 
   #typed() {
+    this.meaning = this.#meaning;
     const values = this.fields.map((field, k) => quantity(field.value, k < 2 ? LENGTHS : ANGLES));
     this.fields.forEach((field, k) => field.setAttribute("aria-invalid", String(field.value !== "" && values[k] === null)));
     this.pose = values.includes(null) ? null : values;
