@@ -12,6 +12,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import made
 import msgspec
@@ -22,10 +24,13 @@ from chromium import chromium, needs_chromium
 from PIL import Image
 from ports import free_port
 from rerun.chunk import Chunk, RrdReader
-from trirail.cli import view
+from trirail.cli import remote_view, view
 from trirail.config import SIM, load
+from trirail.errors import ServiceError
+from trirail.processes.publications import info
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
+from trirail.wire import zenoh_session
 from trirail.wire.endpoints import is_local
 from waiting import wait_until
 
@@ -179,3 +184,43 @@ def test_reruns_programs_are_told_to_send_no_analytics() -> None:
         asked = [sys.executable, "-m", "rerun_cli", "analytics", "config"]
         told = subprocess.run(asked, env=environment, capture_output=True, check=True)
         assert msgspec.json.decode(told.stdout)["analytics_enabled"] is False
+
+
+@pytest.mark.parametrize("names", [["demo"], ["left", "right"]])
+def test_a_view_from_records_ends_with_words_when_a_service_is_restarted(
+    names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its times begin again, which the viewer would show before all that it has, with another robot perhaps."""
+    queues: list[Any] = []
+
+    def publish(cycle: int) -> None:
+        records = made.records(0.5)
+        records["cycle"] += cycle
+        queues[-1].put(records.tobytes())
+
+    def subscribe(robot: Any, _name: str) -> None:
+        queues.append(robot._queue)
+        publish(3_600_000)
+
+    @contextmanager
+    def viewer(*_: str) -> Iterator[Any]:
+        publish(3_600_500)
+        publish(0)
+        yield SimpleNamespace(poll=lambda: None, wait=lambda: 0)  # the person does not close it
+
+    @contextmanager
+    def service(name: str, *_: Any, **__: Any) -> Iterator[Any]:
+        yield SimpleNamespace(info=lambda: msgspec.structs.replace(info(load(SIM)), robot=name))
+
+    session = SimpleNamespace(close=lambda: None)
+    monkeypatch.setattr(zenoh_session, "open_client", lambda *_: session)
+    monkeypatch.setattr(remote_view.RemoteRobot, "_subscribe", subscribe)
+    for name, instead in (("Robot", service), ("_rerun", viewer), ("has_display", lambda: True)):
+        monkeypatch.setattr(view, name, instead)
+    monkeypatch.setattr(view, "credentials_for", lambda *_: None)
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(ServiceError, match=f"service of {names[-1]} was restarted.* run trirail view again"):
+            view.run(None, names, "tcp/127.0.0.1:1", None, web=False, records=True, say=lambda *_: None)
+    finally:
+        signal.signal(signal.SIGTERM, handler)

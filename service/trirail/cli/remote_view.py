@@ -38,12 +38,14 @@ class RemoteView:
 
     def __init__(self, robots: Sequence[Info], connect: str, credentials: Credentials | None = None) -> None:
         self._session = zenoh_session.open_client(connect, credentials)
+        self.ended = threading.Event()
+        """Set when the service of a robot has been restarted. Its times begin again, so this view cannot continue."""
         self.robots: list[RemoteRobot] = []
         """Robots that are drawn, in the order of the argument `robots`."""
         try:
             for info in robots:
                 root = f"/{info.robot}" if len(robots) > 1 else ""
-                self.robots.append(RemoteRobot(info, self._session, f"{info.robot} from {connect}", root))
+                self.robots.append(RemoteRobot(info, self._session, f"{info.robot} from {connect}", root, self.ended))
             server = live_server(free_port(), HISTORY_MB)
         except BaseException:
             self._session.close()  # type: ignore[no-untyped-call]
@@ -75,10 +77,14 @@ class RemoteView:
 class RemoteRobot:
     """Received data of one robot, and its drawing. Raises ServiceError if no records arrive.
 
+    `ended` is set when the service has been restarted; nothing is drawn from then on.
     Wall-clock times are based on this machine's clock at the first record, so they are late by the network delay.
     """
 
-    def __init__(self, info: Info, session: zenoh.Session, name: str, root: str) -> None:
+    def __init__(self, info: Info, session: zenoh.Session, name: str, root: str, ended: threading.Event) -> None:
+        self.restarted = False
+        """Whether the service has been restarted."""
+        self._ended = ended
         self._queue: queue.SimpleQueue[Event | State | bytes | None] = queue.SimpleQueue()
         self.lost = 0
         """Number of cycles that were lost between the service and this program."""
@@ -138,7 +144,7 @@ class RemoteRobot:
         )
 
     def _run(self) -> None:
-        while (item := self._queue.get()) is not None:
+        while not self.restarted and (item := self._queue.get()) is not None:
             if isinstance(item, bytes):
                 self._records(item)
             elif isinstance(item, Event):
@@ -148,7 +154,11 @@ class RemoteRobot:
 
     def _records(self, batch: bytes) -> None:
         cycles = unpack(batch)["cycle"]
-        if self._cycle is not None and cycles[0] > self._cycle:
+        if self._cycle is not None:
+            if cycles[0] <= self._cycle:
+                self.restarted = True
+                self._ended.set()
+                return
             self.lost += int(cycles[0]) - self._cycle - 1
         self._cycle = int(cycles[-1])
         self.streams.records(batch)

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +28,8 @@ from trirail.wire.endpoints import is_local
 
 WEB_PORT = 9090
 """Preferred port of the web viewer, used if it is free."""
+POLL_S = 0.2
+"""Interval at which the end of a viewer and of its data is checked [s]."""
 START_TIMEOUT_S = 20.0
 """Time-out for the start of the web viewer [s]."""
 
@@ -53,14 +56,20 @@ def run(
             "needs a browser, or, on a machine with a display, trirail view --connect tcp/<this machine>:7447"
         )
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with _source(file, robots, connect, tls, records) as source, contextlib.suppress(KeyboardInterrupt):
+    with _source(file, robots, connect, tls, records) as (source, ended), contextlib.suppress(KeyboardInterrupt):
         if web:
-            _browse(source, say)
+            _browse(source, ended, say)
         else:
             say({"source": source}, f"viewer on {source}; close it or press Ctrl-C to end")
             with _rerun(*(["--connect", source] if "://" in source else [source]), "--port", "auto") as viewer:
-                viewer.wait()
+                _wait(viewer, ended)
     return 0
+
+
+def _wait(viewer: subprocess.Popen[bytes], ended: threading.Event) -> None:
+    """Wait until the viewer is closed, or until its data has ended."""
+    while viewer.poll() is None and not ended.wait(POLL_S):
+        pass
 
 
 def has_display() -> bool:
@@ -69,13 +78,16 @@ def has_display() -> bool:
 
 
 @contextlib.contextmanager
-def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | None, records: bool) -> Iterator[str]:
-    """Yield the file or the address of the live view.
+def _source(
+    file: Path | None, robots: Sequence[str], connect: str, tls: Path | None, records: bool
+) -> Iterator[tuple[str, threading.Event]]:
+    """Yield the file or the address of the live view, and an event that is set when the view has ended.
 
-    The live view is the service's own, or is drawn on this machine from records.
+    The live view is the service's own, or is drawn on this machine from records. Raises ServiceError at the end if the
+    view has ended because a service was restarted.
     """
     if file is not None:
-        yield str(file)
+        yield str(file), threading.Event()
         return
     infos = []
     for robot in dict.fromkeys(robots):
@@ -85,7 +97,12 @@ def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | 
         from trirail.cli.remote_view import RemoteView
 
         with RemoteView(infos, connect, credentials_for(robots[0], connect, tls)) as drawn:
-            yield drawn.url
+            yield drawn.url, drawn.ended
+        if restarted := [info.robot for info, robot in zip(infos, drawn.robots, strict=True) if robot.restarted]:
+            raise ServiceError(
+                f"the view has ended, because the service of {', '.join(restarted)} was restarted: its times begin "
+                "again, and its configuration may have changed; run trirail view again"
+            )
         return
     (info,) = infos
     if not info.live:
@@ -101,10 +118,10 @@ def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | 
             f"nothing answers at {info.live} on this machine: "
             "if the service runs on another machine, use trirail view --records"
         ) from error
-    yield info.live
+    yield info.live, threading.Event()
 
 
-def _browse(source: str, say: Callable[[dict[str, str], str], None]) -> None:
+def _browse(source: str, ended: threading.Event, say: Callable[[dict[str, str], str], None]) -> None:
     """Serve the web viewer on this machine's loopback only, until the viewer ends."""
     port, data_port = _web_port(), free_port()
     address = source if "://" in source else f"rerun+http://{LOOPBACK}:{data_port}/proxy"
@@ -120,7 +137,7 @@ def _browse(source: str, say: Callable[[dict[str, str], str], None]) -> None:
         say({"url": url, "source": source}, f"{source} in the browser, on this machine alone, until Ctrl-C: {url}")
         if has_display():
             webbrowser.open(url)
-        server.wait()
+        _wait(server, ended)
 
 
 @contextlib.contextmanager
