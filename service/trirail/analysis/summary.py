@@ -17,7 +17,6 @@ from trirail.telemetry.recording import RecordedAlignment, Recording
 from trirail.wire.goals import kind_name
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, GoalRequest
-from trirail.wire.records import slider_positions
 from trirail.wire.state import Percentiles
 from trirail.wire.vocabulary import MODES, Mode
 
