@@ -37,7 +37,7 @@ from trirail.errors import ConfigError, KinematicsError
 from trirail.kinematics.calibration import corrected
 from trirail.kinematics.correction import Correction
 from trirail.kinematics.geometry import LEGS
-from trirail.kinematics.robot import forward
+from trirail.kinematics.robot import forward, inverse
 from trirail.processes.publications import info
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.state import State
@@ -262,7 +262,9 @@ def test_a_drive_reads_the_fitted_positions_with_the_file_that_is_written(
     old = parse(text := config_edit.edit_text(text, changes))
     built = built_otherwise(geometry(old.geometry), rng, 1e-6, 1e-6)  # larger errors can move a singular angle
     new = parse(config_edit.edit_geometry(text, built, scales, None))
-    positions = np.array([rng.uniform(low, high, 9) for low, high in old.limits.slider.positions])
+    platform = old.limits.platform  # within its limits, the robot is far from singular, so that errors stay small
+    poses = np.stack([rng.uniform(*limits, 9) for limits in (platform.x, platform.y, platform.phi)], axis=1)
+    positions = inverse(geometry(old.geometry), poses).position.T
     readings, fitted = np.empty((2, 3, 9))
     for i, (axis, before, after) in enumerate(zip(LEGS, old.drives.each, new.drives.each, strict=True)):
         counts = [scaling.scale_of(axis, before).counts(position) for position in positions[i].tolist()]
