@@ -216,7 +216,7 @@ class RefusalCode(StrEnum):
     BUSY = "busy", "too many messages, goals or commands are waiting", "send fewer, or more slowly"
     NAME_IN_USE = (
         "name_in_use",
-        "another service in the Zenoh network has the same robot name, so the request would reach both robots",
+        "another service in the network has the same robot name, so both robots would move",
         "give each robot its own name; stops always work",
     )
     STOPPED = "stopped", "a stop arrived before the goal started", "send the goal again"

@@ -104,6 +104,7 @@ def test_sliders_are_reported_without_the_backlash_compensation(monkeypatch: pyt
     compensated = records.copy()
     compensated["backlash"] = np.where(records["velocity"] > 0.0, 1e-3, -1e-3)
     compensated["position"] += compensated["backlash"]
+    compensated["commanded_position"] += compensated["backlash"]
     drawn: dict[str, Any] = {}
     monkeypatch.setattr(charts, "_draw_curves", lambda panel, _, values, __: drawn.update({panel: values}))
     monkeypatch.setattr(charts, "_label_curves", lambda *_: None)

@@ -184,8 +184,8 @@ class ForkServer:
 
     def _on_failure(self, request: _Request, error: OSError) -> None:
         """Report that a child could not be forked. The supervisor may request it again."""
+        self._done(request)  # closes the pipe, which a child that has ended has closed too
         self._send(ChildEnd(request.fork.number, os.EX_OSERR, f"the system starts no process: {error.strerror}"))
-        self._done(request)
 
     def _become(self, request: _Request, work: Callable[[Child], int]) -> NoReturn:
         """Run the child's work in the forked process, after closing the descriptors of the other children."""
