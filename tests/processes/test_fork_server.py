@@ -185,7 +185,8 @@ def test_a_child_that_cannot_be_forked_is_told_with_the_reason_and_another_can(
     (parent.folder / f"no-{call}").touch()
     child = parent.child(name)
     assert parent.until_over(child) == "the system starts no process: no more processes"
-    assert os.read(child.pipe, 1) == b""
+    while os.read(child.pipe, 4096):  # a child may send something before it is killed; the pipe is closed afterwards
+        pass
     server = parent.server.pid
     assert Path(f"/proc/{server}/task/{server}/children").read_text() == ""
     (parent.folder / f"no-{call}").unlink()
