@@ -7,6 +7,7 @@ import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from processes.test_quiet_outputs import session as session_with_outputs
 from trirail.analysis import replay
 from trirail.config import Config
 from trirail.control.control import Control
+from trirail.processes import loop
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
 from trirail.wire import links
@@ -44,7 +46,7 @@ from trirail.wire.packets import (
     Kind,
     decode_answer,
 )
-from trirail.wire.records import DTYPE
+from trirail.wire.records import DTYPE, Part
 from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME, ERROR
 from trirail_drivers.cia402.canopen_frames import SYNC
@@ -553,6 +555,30 @@ def test_what_a_command_to_the_drives_beside_cycles_warns_of_is_reported(tmp_pat
     finally:
         session.close()
     assert len([each for each in events if "cannot send" in each.event.message]) == 1
+
+
+def test_the_parts_of_a_cycle_are_measured_from_its_own_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a frame that nobody expected makes Python finish the cycles beside a decision."""
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter_ns=lambda: round(session.clock() * 1e9)))
+    quiet = quiet_of(session)
+    quiet.cycles_beside = 2, 2
+    run_beside, strange = quiet.run_beside, list[int]()
+
+    def ambushed(*arguments: Any) -> Any:
+        strange.append(session.loop.control.cycles)
+        session.inject(CAN_FRAME.pack(0x123, 2, b"ab"))
+        return run_beside(*arguments)
+
+    quiet.run_beside = ambushed  # type: ignore[assignment, method-assign]
+    try:
+        records, _, _ = recorded(session, script(1), CYCLES)
+    finally:
+        session.close()
+    assert len(strange) > 5
+    period_ns = round(session.loop.control.period * 1e9)
+    measured = records["parts_ns"][:, : Part.RECORD]
+    assert (measured.sum(axis=1) < period_ns).all(), records["cycle"][measured.sum(axis=1) >= period_ns]
 
 
 @pytest.mark.parametrize("strange", [False, True])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import resource
 import socket
@@ -38,8 +39,17 @@ def use_up() -> Iterator[Callable[[], None]]:
 
 def test_the_heap_is_trimmed_again_later(use_up: Callable[[], None]) -> None:
     heap = HeapTrim()
+    soft = resource.getrlimit(resource.RLIMIT_NOFILE)
     use_up()
+    heap._due = 0.0
     heap.poll()
+    assert heap._due > 0.0
+    before = heap._least
+    resource.setrlimit(resource.RLIMIT_NOFILE, soft)
+    heap._due = 0.0
+    heap.poll()
+    assert 0 < heap._least < math.inf
+    assert before >= heap._least
 
 
 def test_all_descriptors_count_as_used_where_the_kernel_does_not_count_them(

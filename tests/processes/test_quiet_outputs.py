@@ -107,8 +107,9 @@ def test_a_socket_that_is_full_within_a_cycle_keeps_outputs_for_the_next(room: i
     both_ways(PINS, tmp_path, lambda: happens, 450)
 
 
-def test_outputs_by_sdo_are_left_to_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A drive whose 60FEh no PDO takes; commands only, since its outputs may not be on a path."""
+@pytest.fixture
+def by_sdo(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drives whose outputs, object 60FEh, no PDO takes."""
     made = ObjectEntry.__init__
 
     def unmappable(entry: ObjectEntry, variable: ODVariable) -> None:
@@ -116,6 +117,11 @@ def test_outputs_by_sdo_are_left_to_python(tmp_path: Path, monkeypatch: pytest.M
         entry.mappable = entry.mappable and entry.index != 0x60FE
 
     monkeypatch.setattr(ObjectEntry, "__init__", unmappable)
+
+
+@pytest.mark.usefixtures("by_sdo")
+def test_outputs_by_sdo_are_left_to_python(tmp_path: Path) -> None:
+    """Commands only, since these outputs may not be on a path."""
     happens = dict[int, list[Happening]]()
     requests: list[CommandRequest | GoalRequest] = [
         CommandRequest(30, "ann", Command.ENABLE),
@@ -132,14 +138,8 @@ def test_outputs_by_sdo_are_left_to_python(tmp_path: Path, monkeypatch: pytest.M
     assert one.loop.control.fault is None
 
 
-def test_an_output_by_sdo_whose_request_is_lost_is_sent_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = ObjectEntry.__init__
-
-    def unmappable(entry: ObjectEntry, variable: ODVariable) -> None:
-        made(entry, variable)
-        entry.mappable = entry.mappable and entry.index != 0x60FE
-
-    monkeypatch.setattr(ObjectEntry, "__init__", unmappable)
+@pytest.mark.usefixtures("by_sdo")
+def test_an_output_by_sdo_whose_request_is_lost_is_sent_again(tmp_path: Path) -> None:
     session = Session(PINS, tmp_path, "unix", quiet=True)
     take, lost = session.ends.take, list[bytes]()
 
