@@ -236,7 +236,7 @@ class PlanRequests:
         if self._request is not None and self._request.version != self._schedule.version:
             self._request = None  # the motion has changed since the request
         if self._request is None:
-            if self._awaits_lower_rate(self._goal):
+            if self._awaits_lower_rate:
                 return None
             if self._change is None or self._change.applied or self._change.cycles >= MAX_RATE_CHANGE_CYCLES:
                 self._request_plan(self._goal)
@@ -253,21 +253,25 @@ class PlanRequests:
         rate, last = self.override, self._schedule.last
         if last is not None:
             rate = min(rate, last.allowed_rate)
-        if self._goal is not None and self._extends_motion:
-            rate = min(rate, self._goal.greatest_rate)
-        return rate
+        return min(rate, self._goal_rate) if self._extends_motion else rate
+
+    @property
+    def _goal_rate(self) -> float:
+        """Greatest rate that the goal being planned allows; infinite if there is no such goal."""
+        return self._goal.greatest_rate if self._goal is not None else math.inf
 
     @property
     def _extends_motion(self) -> bool:
         """Whether the goal being planned follows the current motion without preempting it."""
         return self._blend is not None and self._schedule.last is not None and not self._schedule.ended
 
-    def _awaits_lower_rate(self, goal: Goal) -> bool:
+    @property
+    def _awaits_lower_rate(self) -> bool:
         """Whether the current motion is faster than the goal allows, so that the goal cannot follow on its path yet."""
         last = self._schedule.last
         if last is None or not self._extends_motion:
             return False
-        return max(last.law_state.rate, last.target) > goal.greatest_rate
+        return max(last.law_state.rate, last.target) > self._goal_rate
 
     def _start_rate_change(self) -> None:
         """Start changing the rate of the current motion to its target."""
@@ -337,7 +341,7 @@ class PlanRequests:
             self._request = None  # too late
             return None
         run = self._planned_run or unpack_run(self._legs, planned.run)
-        run.greatest_rate = self._goal.greatest_rate if self._goal is not None else math.inf
+        run.greatest_rate = self._goal_rate
         run.marks.append(self._marks(planned.switches))
         runs = deque([run])
         if planned.reply.stops_first and schedule.runs:
@@ -391,8 +395,7 @@ class PlanRequests:
         ):
             self._request = None
             return None
-        greatest_rate = self._goal.greatest_rate if self._goal is not None else math.inf
-        schedule.append(extended.s, path, self._marks(extended.switches), greatest_rate)
+        schedule.append(extended.s, path, self._marks(extended.switches), self._goal_rate)
         return AcceptedPlan(extended.reply.with_duration(schedule.remaining if run.target else math.inf))
 
 

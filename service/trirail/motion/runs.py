@@ -208,7 +208,7 @@ class Run:
         Marks of earlier goals after `s` are not used, unless the new goal is dropped. The part of the path that the
         motion has passed is removed, so that the path does not grow as long as goals follow each other.
         """
-        before = remaining(self.path, self.law_state.s)
+        before = without_passed(self.path, self.law_state.s)
         longer = joined([cut(before, s), path])
         self.marks.append(marks or GoalMarks())
         self.marks[-1].begin = s
@@ -325,8 +325,8 @@ def joined(paths: Sequence[Path]) -> Path:
     return Path(np.concatenate(knots), np.concatenate([path.pieces for path in paths]), paths[0].in_sliders, tools)
 
 
-def remaining(path: Path, s: float) -> Path:
-    """Return a path without the pieces that end before the piece which precedes the time `s` [s].
+def without_passed(path: Path, s: float) -> Path:
+    """Return a path without the pieces that the motion has passed at the time `s` along the path [s], except the last.
 
     The times along the path do not change, so that its first knot may be later than zero.
     """

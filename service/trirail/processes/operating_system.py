@@ -70,9 +70,9 @@ class Signals:
     """Receiver of the signals that end the service and of SIGTSTP, whose socket `reader` can be passed to select.
 
     SIGTSTP, SIGTTIN and SIGTTOU do not stop the process, because it must not freeze while the robot moves. Under nohup,
-    SIGHUP is still ignored. The kernel may deliver a signal to any thread, but Python runs its handlers
-    only in the main thread, which may be waiting for a lock. A signal in another thread would not wake the main thread.
-    Data in a socket does.
+    SIGHUP is still ignored. The kernel may deliver a signal to any thread, but Python runs its handlers only in the
+    main thread, which may be waiting for a lock. A signal in another thread would not wake the main thread. Data in a
+    socket does.
     """
 
     def __enter__(self) -> Signals:
