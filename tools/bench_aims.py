@@ -34,6 +34,10 @@ BRIEF = {
 """Options for a brief run."""
 
 
+Measured = Callable[[Results], tuple[float, ...]]
+"""Function that returns the numbers for an aim from the results of all benchmarks, or of `loop` at one rate."""
+
+
 class Aim(NamedTuple):
     """Aim of the service: one row of the table."""
 
@@ -41,7 +45,7 @@ class Aim(NamedTuple):
     before: str
     """Result of an earlier version."""
     aim: tuple[float, ...]
-    measured: Callable[[Results], tuple[float, ...]]
+    measured: Measured
     """Function that returns one number for each limit in `aim`, which it must not exceed; no numbers if the service
     could not keep the rate.
     """
@@ -52,18 +56,24 @@ def at(results: Results, rate: int) -> Results:
     return next(loop for loop in results["loop"]["rates"] if loop["rate_hz"] == rate)
 
 
-def _missed(results: Results, rate: int, of: int | None = None) -> tuple[float, ...]:
-    """Return the number of missed ticks, minus the ticks that the machine itself lost, in total or per `of` cycles."""
-    loop = at(results, rate)
-    if "not_kept" in loop:
-        return ()
-    missed = max(0, loop["missed"] - loop["lost_by_the_machine"])
-    return (float(missed if of is None else missed * of / loop["cycles"]),)
+def _loop(rate: int, measured: Measured) -> Measured:
+    """Return a function that applies `measured` to the results of `loop` at a rate, if the service kept this rate."""
+
+    def measured_if_kept(results: Results) -> tuple[float, ...]:
+        loop = at(results, rate)
+        return () if "not_kept" in loop else measured(loop)
+
+    return measured_if_kept
 
 
-def _cycle_to_bare(results: Results, rate: int) -> tuple[float, ...]:
+def _missed(loop: Results) -> float:
+    """Return the number of missed ticks, minus the ticks that the machine itself lost."""
+    return float(max(0, loop["missed"] - loop["lost_by_the_machine"]))
+
+
+def _cycle_to_bare(loop: Results) -> tuple[float, ...]:
     """Return the duration of the service's cycle divided by that of the bare loop's cycle, at p50, p99 and p99.9."""
-    return tuple(at(results, rate).get("to_bare", {}).get("cycle", ())[:3])
+    return tuple(loop["to_bare"]["cycle"][:3])
 
 
 def _to_canopen(deviations: Results) -> tuple[float, ...]:
@@ -101,32 +111,32 @@ AIMS = (
         "whole cycle with its decisions at 1 kHz to the bare loop, p50 / p99 / p99.9",
         "1.6 / 8.2",
         (1.6, 2.0, 3.0),
-        lambda results: _cycle_to_bare(results, 1000),
+        _loop(1000, _cycle_to_bare),
     ),
     Aim(
         "the same at 2 kHz",
         "not measured",
         (1.6, 2.0, 3.0),
-        lambda results: _cycle_to_bare(results, 2000),
+        _loop(2000, _cycle_to_bare),
     ),
     Aim(
         "SYNC to the last setpoint at 1 kHz, p99.9 [µs]",
         "p50 227",
         (150.0,),
-        lambda results: (at(results, 1000)["to_setpoints"][2],),
+        _loop(1000, lambda loop: (loop["to_setpoints"][2],)),
     ),
-    Aim("ticks missed at 1 kHz beyond the machine's", "46", (0.0,), lambda results: _missed(results, 1000)),
+    Aim("ticks missed at 1 kHz beyond the machine's", "46", (0.0,), _loop(1000, lambda loop: (_missed(loop),))),
     Aim(
         "ticks missed at 2 kHz beyond the machine's, of 100,000",
         "3303",
         (10.0,),
-        lambda results: _missed(results, 2000, of=100_000),
+        _loop(2000, lambda loop: (_missed(loop) * 100_000 / loop["cycles"],)),
     ),
     Aim(
         "lateness p99.9 to the machine's, the worst of the runs",
         "1.2 to 1.5",
         (1.2,),
-        lambda results: (max(run["ratio"][2] for run in at(results, 1000)["runs"]),),
+        _loop(1000, lambda loop: (max(run["ratio"][2] for run in loop["runs"]),)),
     ),
     Aim(
         "goal to first changed setpoint, at rest, p99 [ms]",

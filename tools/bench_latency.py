@@ -106,11 +106,16 @@ def measure(made: Rig, goals: int) -> dict[str, Any]:
         in_motion = _each(goals, made.robot, heard, chance, _in_motion)
     return {
         "quantiles": QUANTILES,
-        "at_rest_ms": quantiles([1e3 * value for value in at_rest if value is not None]),
-        "in_motion_ms": quantiles([1e3 * value for value in in_motion if value is not None]),
+        "at_rest_ms": quantiles_ms(at_rest),
+        "in_motion_ms": quantiles_ms(in_motion),
         "goals": goals,
         "without_effect": at_rest.count(None) + in_motion.count(None),
     }
+
+
+def quantiles_ms(latencies: list[float | None]) -> list[float]:
+    """Return the times at QUANTILES [ms]. A goal without effect counts with the longest time, CHANGE_TIMEOUT_S."""
+    return quantiles([1e3 * (CHANGE_TIMEOUT_S if value is None else value) for value in latencies])
 
 
 def _each(goals: int, robot: Robot, heard: Listener, chance: random.Random, measured: Measured) -> list[float | None]:

@@ -74,3 +74,13 @@ def test_exchanged_names_are_seen_and_right_ones_are_not_suspected(seed: int, n:
         assert order == (1, 0)
     elif order is not None:
         assert {k for k, m in enumerate(order) if k != m} == set(first.tolist())
+
+
+@given(st.sampled_from([(2, 90.0), (3, 80.0), (4, 61.0), (5, 48.0), (6, 40.0)]), st.floats(-1.0, 1.0))
+def test_corners_of_a_regular_polygon_are_not_suspected_within_the_angle_that_is_promised(
+    polygon: tuple[int, float], share: float
+) -> None:
+    number, most = polygon
+    angles = 2.0 * np.pi / number * np.arange(number)
+    to = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
+    assert find_swap(to @ rotation_matrix(np.radians(share * most)).T, to) is None

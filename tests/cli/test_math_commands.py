@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,15 @@ def test_the_plot_is_a_picture(angles: str, tmp_path: Path, capsys: pytest.Captu
     assert min(height, width) > 800
     colourful = np.ptp(picture[..., :3], axis=2) > 0.2
     assert colourful.mean() > 0.02  # slices and strip, not only lines
+
+
+@pytest.mark.long
+def test_a_range_without_a_whole_degree_has_one_slice(answer: Any, tmp_path: Path) -> None:
+    config, file = tmp_path / "narrow.toml", tmp_path / "workspace.png"
+    config.write_text(re.sub(r"(?m)^phi = .*", "phi = [0.002, 0.012]", SIM.read_text(encoding="utf-8"), count=1))
+    assert [each["phi"] for each in answer(f"workspace --config {config}")["slices"]] == [pytest.approx(0.007)]
+    assert call(f"workspace --plot {file} --config {config}") == 0
+    assert file.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 
 import msgspec
@@ -69,7 +70,7 @@ def test_a_pose_in_a_work_frame_is_where_the_frame_is(pose: Pose, tool: str | tu
     goal = resolve_goal(PoseGoal(*pose, frame="part", tool=tool), NamedFrames(TABLE), lambda _: pose)
     assert isinstance(goal, PoseGoal)
     assert complex(goal.x, goal.y) == pytest.approx(complex(0.02, 0.01) + turned(pose[0], pose[1], math.pi / 2.0))
-    assert goal.phi == pytest.approx(math.pi / 2.0 + pose[2])
+    assert goal.phi == pytest.approx(math.remainder(math.pi / 2.0 + pose[2], math.tau))
 
 
 @pytest.mark.parametrize("angle", [-2.0, 0.0, 1e-9, 1.0, math.pi])
@@ -78,6 +79,16 @@ def test_a_frame_may_be_turned_by_any_angle(angle: float) -> None:
     goal = resolve_goal(PoseGoal(0.03, -0.01, 0.1, frame="part"), NamedFrames(table), lambda _: (0.0, 0.0, 0.0))
     assert isinstance(goal, PoseGoal)
     assert complex(goal.x, goal.y) == pytest.approx(complex(0.02, 0.01) + turned(0.03, -0.01, angle))
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.sampled_from([-1, 0, 1]))
+def test_an_angle_in_a_work_frame_means_the_same_after_whole_turns(angle: float, phi: float, turns: int) -> None:
+    table = FramesTable(work={"part": (0.02, 0.01, angle)})
+    sent = PoseGoal(0.03, -0.01, phi - angle + turns * math.tau, frame="part")
+    goal = resolve_goal(sent, NamedFrames(table), lambda _: (0.0, 0.0, 0.0))
+    assert isinstance(goal, PoseGoal)
+    assert abs(goal.phi) <= math.pi
+    assert cmath.rect(1.0, goal.phi) == pytest.approx(cmath.rect(1.0, phi))
 
 
 @pytest.mark.parametrize(

@@ -138,16 +138,21 @@ def test_an_aim_is_met_where_no_number_is_greater() -> None:
     assert len(rows) == 2, "what was not measured is left out"
 
 
-def test_a_rate_that_is_not_kept_is_said_and_not_met() -> None:
+@pytest.mark.parametrize(("rate", "rows_of_rate"), [(1000, 4), (2000, 2)])
+def test_a_rate_that_is_not_kept_is_said_and_not_met(rate: int, rows_of_rate: int) -> None:
     cycles = Cycles(np.array([10_000, 600_000]), np.array([20_000, 40_000]), 250_000, 5)
     bare = bench_loop.together([(cycles, 1), (cycles, 0)])
     assert (bare["cycles"], bare["answers"], bare["missed"], bare["lost_by_the_machine"]) == (4, 10, 4, 1)
     assert bare["cycle"][-1] == 40.0
-    found = bench_loop.with_ratios({"rate_hz": 2000, "seconds": 1.0, "not_kept": "9 faults"}, bare)
+    found = bench_loop.with_ratios({"rate_hz": rate, "seconds": 1.0, "not_kept": "9 faults"}, bare)
     assert "to_bare" not in found
     assert any("9 faults" in line for line in bench.lines({"rates": [found]}))
     rows = bench_aims.table({"loop": {"rates": [found]}})
-    assert [(row["measured"], row["met"]) for row in rows] == [((), False)] * 2, "the ratio and the ticks missed"
+    assert [(row["measured"], row["met"]) for row in rows] == [((), False)] * rows_of_rate
+
+
+def test_goals_without_effect_count_with_the_longest_time() -> None:
+    assert bench_latency.quantiles_ms([0.001] * 50 + [None] * 50)[1] == 1e3 * bench_latency.CHANGE_TIMEOUT_S
 
 
 def test_a_stage_that_measured_its_geometry_needs_one_correction_where_today_it_needs_two() -> None:

@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from trirail.config import SIM, Limits, load
 from trirail.errors import KinematicsError
+from trirail.kinematics.correction import Correction
 from trirail.kinematics.geometry import Geometry, Leg, singular_angles
 from trirail.kinematics.robot import inverse, jacobians
 from trirail.workspace.aspect import phi_range
@@ -249,6 +250,20 @@ def test_vertices_are_exact() -> None:
         kept = slack(PAPER, LIMITS, np.column_stack([polygon, np.full(len(polygon), phi)]))[:, :-1]
         assert kept.min() > -1e-12
         assert (np.count_nonzero(kept < 1e-12, axis=1) >= 2).all()
+
+
+@given(st.floats(-5e-4, 5e-4), st.floats(-5e-4, 5e-4), st.floats(0.5, 3.0), st.floats(-0.9, 0.7))
+@settings(deadline=None)
+def test_with_as_built_errors_a_slice_is_as_far_off_as_they_are_curved(
+    x: float, y: float, curvature: float, phi: float
+) -> None:
+    nodes, along = np.zeros((7, 7, 7, 3)), np.linspace(-1.25, 1.25, 7)
+    nodes[..., 0], nodes[..., 1] = x * np.sin(curvature * along)[:, None, None], y * np.sin(curvature * along)[:, None]
+    robot = replace(PAPER, correction=Correction((-0.15, -0.15, -1.2), (0.15, 0.15, 0.85), nodes))
+    polygon = reachable_slice(robot, LIMITS, phi)
+    kept = slack(robot, LIMITS, np.column_stack([polygon, np.full(len(polygon), phi)]))[:, :-1]
+    # A linear function differs from x * sin(curvature * along) by at most x, and both errors move every slider.
+    assert np.abs(kept).min(axis=1).max() <= 1.1 * (abs(x) + abs(y)) + 1e-12
 
 
 @given(robots, some_limits, st.floats(-1.0, 0.8))

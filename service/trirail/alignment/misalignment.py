@@ -109,7 +109,7 @@ def measure_misalignment(
         moved = ", ".join(name for n, name in enumerate(names) if order[n] != n)
         raise AlignmentError(
             AlignmentFault.SWAPPED,
-            f"marks {moved} are swapped, or the part is rotated by more than 90°; "
+            f"marks {moved} are swapped, or the part is rotated too far to tell them apart; "
             "check the names of the marks and the part",
         )
     error = worst_distance_error(at, to)

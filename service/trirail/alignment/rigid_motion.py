@@ -92,7 +92,8 @@ def worst_distance_error(points: Floats, targets: Floats) -> float:
 def find_swap(points: Floats, targets: Floats) -> tuple[int, ...] | None:
     """Return an order of the points that fits the targets much better than the given order; None if there is none.
 
-    If the part is rotated by less than 90°, the correct order always fits best.
+    The correct order can be mistaken for a swap if the marks form a regular polygon and the part is rotated far: four
+    marks by more than 61°, six by more than 40°.
     """
     if len(points) > MAX_PERMUTED_MARKS:
         return None

@@ -224,12 +224,15 @@ def workspace(
 
 
 def _round_angles(low: float, high: float) -> list[float]:
-    """Return the multiples [rad] of a round number of degrees in a range, few enough to be viewed together."""
+    """Return the multiples [rad] of a round number of degrees in a range, few enough to be viewed together.
+
+    If the range contains no whole degree, return its middle.
+    """
     for step in SLICE_STEPS_DEG:
         first, last = math.ceil(math.degrees(low) / step), math.floor(math.degrees(high) / step)
         if last - first < MAX_SLICES:
             break
-    return [math.radians(step * k) for k in range(first, last + 1)]
+    return [math.radians(step * k) for k in range(first, last + 1)] or [(low + high) / 2.0]
 
 
 def _draw(file: Path, config: Config, robot: Geometry, angles: list[float], reach: Extent, service: Extent) -> None:

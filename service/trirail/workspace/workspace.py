@@ -25,7 +25,6 @@ EMPTY_POLYGON = np.empty((0, 2))
 EDGE_TOLERANCE_M = 1e-13  # a vertex that is closer to the edge of a half-plane counts as on the edge
 MARGIN_SAMPLES = np.linspace(-1.0, 1.0, 129)  # angles at which det J2 is sampled, in multiples of the margin
 WALL_CLEARANCE_RAD = 1e-4  # closer to a wall, the sign of det J2 is not reliable because of rounding
-SLOPE_STEP_M = 1e-4  # step for slopes, within which as-built errors are nearly linear
 PHI_SLICES = 721  # number of slices for the integral over phi
 GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
@@ -51,19 +50,18 @@ def reachable_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
     in both directions without leaving the aspect of (0, 0, 0). The vertices are exact except for rounding, with one
     exception: if det J2 is not monotonic within the margin, as for robots that are far from symmetric, the true
     boundary is a curve. The polygon then circumscribes the curve, with an error of at most a 64th of the margin.
+
+    With as-built errors, the true boundary is a curve as well. The polygon then uses the affine function that fits the
+    errors best on the boundary, and is wrong by at most the difference from that function.
     """
     phi = math.remainder(phi, 2.0 * math.pi)
     low, high = phi_range(geometry)
     margin = limits.singularity_margin
     if not low + margin <= phi <= high - margin:
         return EMPTY_POLYGON
-    joints = _joint_rows(geometry, phi)
-    positions, passive = limits.slider.positions, limits.slider.passive
-    least, most = np.array([*positions, passive, passive, passive]).T
-    polygon = _parallelogram(joints[[0, 3]], positions[0], passive)
-    unit = np.array([1.0, 0.0, 0.0])
-    polygon = _clip(polygon, joints - np.outer(least, unit))
-    polygon = _clip(polygon, np.outer(most, unit) - joints)
+    polygon = _within_travels(_joint_rows(geometry, phi), limits)
+    if geometry.correction is not None and len(polygon):
+        polygon = _within_travels(_corrected_rows(geometry, phi, polygon), limits)
     # if det J2 were always monotonic, the two ends of the margin would be sufficient
     turned = np.clip(phi + margin * MARGIN_SAMPLES, low + WALL_CLEARANCE_RAD, high - WALL_CLEARANCE_RAD)
     sign = np.sign(det_j2_rows(geometry, np.zeros(1))[0, 0])
@@ -137,11 +135,32 @@ def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geomet
 
 
 def _joint_rows(geometry: Geometry, phi: float) -> Array:
-    """Return rows (6, 3) with position = row @ (1, x, y) [m] for the sliders A, B, C, then for the cross slides."""
-    step = 1.0 if geometry.correction is None else SLOPE_STEP_M
-    at_zero, *beside = travels(geometry, [[0.0, 0.0, phi], [step, 0.0, phi], [0.0, step, phi]]).swapaxes(0, 1)
-    slopes = [(there - at_zero) / step for there in beside]
-    return np.stack([at_zero, *slopes], axis=-1).reshape(6, 3)
+    """Return rows (6, 3) with position = row @ (1, x, y) [m] for the sliders A, B, C, then for the cross slides.
+
+    As-built errors are left out.
+    """
+    x, y, angles = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), np.full(3, phi)
+    at_zero, *beside = np.stack([leg.travels(x, y, angles) for leg in geometry.each], axis=-1).swapaxes(0, 1)
+    return np.stack([at_zero, *(there - at_zero for there in beside)], axis=-1).reshape(6, 3)
+
+
+def _corrected_rows(geometry: Geometry, phi: float, polygon: Array) -> Array:
+    """Return the rows of `_joint_rows` with as-built errors: the best fit along the edges of a polygon (V, 2) [m]."""
+    centres = np.concatenate([polygon, (polygon + np.roll(polygon, -1, axis=0)) / 2.0])
+    positions = travels(geometry, np.column_stack([centres, np.full(len(centres), phi)])).swapaxes(0, 1)
+    known = np.column_stack([np.ones(len(centres)), centres])
+    rows, *_ = np.linalg.lstsq(known, positions.reshape(-1, 6))
+    return np.asarray(rows.T, dtype=np.float64)
+
+
+def _within_travels(joints: Array, limits: Limits) -> Array:
+    """Return the polygon in which all joints, with rows (6, 3), are within their travels."""
+    positions, passive = limits.slider.positions, limits.slider.passive
+    least, most = np.array([*positions, passive, passive, passive]).T
+    polygon = _parallelogram(joints[[0, 3]], positions[0], passive)
+    unit = np.array([1.0, 0.0, 0.0])
+    polygon = _clip(polygon, joints - np.outer(least, unit))
+    return _clip(polygon, np.outer(most, unit) - joints)
 
 
 def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from msgspec import structs
 
 from trirail.config import BASE, PLATFORM
@@ -22,7 +24,10 @@ class PoseMotion(GoalMotion[PoseGoal]):
 
     @staticmethod
     def resolve(goal: PoseGoal, frames: NamedFrames, source: PoseSource) -> PoseGoal:
-        """Return the goal with its pose in the base frame, and with the tool as a point in the platform's frame."""
+        """Return the goal with its pose in the base frame, and with the tool as a point in the platform's frame.
+
+        The angle of a pose in a work frame is between -pi and pi in the base frame.
+        """
         del source
         if goal.frame == PLATFORM:
             raise RefusedError(
@@ -31,7 +36,8 @@ class PoseMotion(GoalMotion[PoseGoal]):
             )
         x0, y0, turned = frames.frame(goal.frame)
         dx, dy = rotated(goal.x, goal.y, turned)
-        there = {"x": x0 + dx, "y": y0 + dy, "phi": turned + goal.phi}
+        phi = goal.phi if goal.frame == BASE else math.remainder(turned + goal.phi, math.tau)
+        there = {"x": x0 + dx, "y": y0 + dy, "phi": phi}
         return structs.replace(goal, **there, tool=frames.tool(goal.tool), frame=BASE)
 
     def check(self, goal: PoseGoal) -> None:
