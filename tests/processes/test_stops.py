@@ -6,9 +6,9 @@ import itertools
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
 from trirail.processes.inbox import MAX_MERGED_STOPS
 from trirail.processes.incoming import Incoming
-from trirail.processes.replies import REMEMBERED_S, Copies
+from trirail.processes.replies import COPY_WITHIN_S, Copies
 from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply, GoalReply
@@ -39,12 +39,28 @@ class Goal(NamedTuple):
 
 
 class StopSent(NamedTuple):
-    """A stop; with `copy` it has an id, and comes again with the next of the same copy."""
+    """A stop, over Zenoh or at the stop port; with `copy` it has an id, which programs use again."""
 
     user: str
     name: str
     content: bytes
     copy: str
+    at_port: bool = False
+
+
+class OnZenoh:
+    """A query that nobody waits for."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def reply(self, *_: object, **__: object) -> None:
+        pass
+
+    reply_err = reply
 
 
 class Read(NamedTuple):
@@ -60,6 +76,7 @@ stops = st.builds(
     st.sampled_from(sorted(STOPS)),
     st.sampled_from(CONTENTS),
     st.sampled_from(["", "", "a", "b"]),
+    st.booleans(),
 )
 sequences = st.lists(goals | stops | stops | st.builds(Read, st.integers(1, 4)), max_size=40)
 
@@ -114,7 +131,8 @@ class Played:
         else:
             content, key, copy = step.content, f"trirail/demo/cmd/{step.user}/{step.name}", step.copy
         kind = "goal" if isinstance(step, Goal) else "cmd"
-        incoming = Incoming(kind, key, len(content), content, "", None, time.monotonic_ns())
+        query: Any = None if isinstance(step, StopSent) and step.at_port else OnZenoh()
+        incoming = Incoming(kind, key, len(content), content, "", query, time.monotonic_ns())
         self._gateway._inbox._keep(incoming._replace(id=copy, at_door=self.answers[number].append))
 
     def _read(self, at_most: int) -> None:
@@ -124,14 +142,24 @@ class Played:
                 self._gateway._handle_packet(self._packets.pop(0), lambda: None)
 
     def acted(self) -> list[int]:
-        """The numbers of the stops but for copies of earlier ones."""
-        seen, first = set(), []
-        for number, message in self.messages.items():
-            if isinstance(message, StopSent):
-                if not message.copy or message not in seen:
-                    first.append(number)
-                seen.add(message)
-        return first
+        """The numbers of the stops but for copies: each stop has one copy at most, on the other channel."""
+        return _acted(self.messages)
+
+
+def _acted(messages: Mapping[int, object]) -> list[int]:
+    alone: set[StopSent] = set()
+    """Stops whose copy has not come."""
+    first = []
+    for number, message in messages.items():
+        if not isinstance(message, StopSent):
+            continue
+        other = message._replace(at_port=not message.at_port)
+        if message.copy and other in alone:
+            alone.discard(other)
+        else:
+            first.append(number)
+            alone.add(message)
+    return first
 
 
 @pytest.fixture(scope="module")
@@ -172,17 +200,18 @@ def test_each_message_is_answered_once_and_numbers_decide_which_goals_begin(
 def test_only_what_is_alike_and_came_one_behind_the_other_is_carried_out_as_one(
     opened: zenoh.Session, sequence: list[StopSent]
 ) -> None:
-    alone = [step._replace(copy="") for step in sequence]
+    alone = [step._replace(copy="", at_port=False) for step in sequence]
     played = Played(opened, list(alone))
     for user in USERS:
         runs = [(key, len(list(same))) for key, same in itertools.groupby(step for step in alone if step.user == user)]
-        names = [name for (_, name, _, _), length in runs for _ in range(-(-length // MAX_MERGED_STOPS))]
+        names = [name for (_, name, *_), length in runs for _ in range(-(-length // MAX_MERGED_STOPS))]
         assert [each.name for each in played.sent if isinstance(each, CommandRequest) and each.user == user] == names
 
 
 def test_a_late_copy_stops_nothing_and_has_the_answer_of_the_first(opened: zenoh.Session) -> None:
     stop = StopSent("ann", "stop", b"", "a")
-    played = Played(opened, [Goal("bob"), stop, Read(9), Goal("bob"), stop, Goal("ann"), Read(9), stop])
+    late = stop._replace(at_port=True)
+    played = Played(opened, [Goal("bob"), stop, Read(9), Goal("bob"), late, Goal("ann"), Read(9)])
     assert [
         (each.name if isinstance(each, CommandRequest) else each.id, getattr(each, "withdrawn", None))
         for each in played.sent
@@ -192,7 +221,27 @@ def test_a_late_copy_stops_nothing_and_has_the_answer_of_the_first(opened: zenoh
         ("bob-2", None),
         ("ann-1", None),
     ]
-    assert played.answers[2] == played.answers[4] == played.answers[6] == [CommandReply("stop", "holding", 1)]
+    assert played.answers[2] == played.answers[4] == [CommandReply("stop", "holding", 1)]
+
+
+# A read after each message: a stop that is not the copy of the one before it is passed on before what comes next.
+@given(
+    sequence=st.lists(
+        goals | st.builds(StopSent, st.just("ann"), st.just("stop"), st.just(b""), st.sampled_from("ab"), st.booleans())
+    )
+)
+def test_no_stop_is_confirmed_without_being_carried_out_however_often_its_id_is_used(
+    opened: zenoh.Session, sequence: list[Goal | StopSent]
+) -> None:
+    played = Played(opened, [each for step in sequence for each in (step, Read(1))])
+    acted = set(played.acted())
+    order = [
+        "stop" if isinstance(step, StopSent) else "goal"
+        for n, step in played.messages.items()
+        if n in acted or isinstance(step, Goal)
+    ]
+    assert ["stop" if isinstance(each, CommandRequest) else "goal" for each in played.sent] == order
+    assert all(len(answers) == 1 for answers in played.answers.values())
 
 
 def test_a_goal_that_was_not_read_when_it_alone_was_stopped_does_not_begin(opened: zenoh.Session) -> None:
@@ -206,7 +255,7 @@ def test_a_goal_that_was_not_read_when_it_alone_was_stopped_does_not_begin(opene
 
 def test_one_that_cannot_be_read_is_carried_out_first_and_refused(opened: zenoh.Session) -> None:
     played = Played(
-        opened, [Goal("bob"), StopSent("ann", "stop", b"no JSON", "a"), StopSent("ann", "stop", b"no JSON", "a")]
+        opened, [Goal("bob"), *(StopSent("ann", "stop", b"no JSON", "a", at_port) for at_port in (False, True))]
     )
     assert [type(each) for each in played.sent] == [CommandRequest, GoalRequest]
     for number in (2, 3):
@@ -215,22 +264,24 @@ def test_one_that_cannot_be_read_is_carried_out_first_and_refused(opened: zenoh.
         assert answer.code is RefusalCode.MALFORMED
 
 
-def stop(name: str, number: int = 1) -> Incoming:
-    return Incoming("cmd", "trirail/demo/cmd/ann/stop", 0, b"", "", None, 0, number, name)
+def stop(name: str, *, at_port: bool = False) -> Incoming:
+    query: Any = None if at_port else OnZenoh()
+    return Incoming("cmd", "trirail/demo/cmd/ann/stop", 0, b"", "", query, 0, id=name)
 
 
 def test_a_copy_of_what_was_refused_for_want_of_room_is_carried_out() -> None:
     copies = Copies()
-    assert copies.first(stop("a"))
-    assert copies.answered(stop("a"), ErrorReply(RefusalCode.BUSY, "send fewer")) == []
-    assert copies.first(stop("a"))
+    sent = copies.add(stop("a"))
+    assert copies.answered(sent, ErrorReply(RefusalCode.BUSY, "send fewer")) is None
+    assert copies.first(stop("a", at_port=True)) is None
 
 
-def test_copies_are_forgotten_when_nobody_waits_for_them_any_more() -> None:
+@given(late=st.floats(0.0, 2.0 * COPY_WITHIN_S), answer_after=st.floats(0.0, 100.0))
+def test_a_copy_comes_at_most_a_short_time_after_the_reply(late: float, answer_after: float) -> None:
     now = 0.0
     copies = Copies(lambda: now)
-    assert copies.first(stop("a"))
-    assert not copies.first(stop("a"))
-    now = REMEMBERED_S
-    assert copies.first(stop("b"))
-    assert copies.first(stop("a"))
+    sent = copies.add(stop("a"))
+    now = answer_after
+    copies.answered(sent, CommandReply("stop", "holding", 1))
+    now = answer_after + late
+    assert (copies.first(stop("a", at_port=True)) is sent.pair) == (now - answer_after <= COPY_WITHIN_S)

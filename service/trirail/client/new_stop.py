@@ -28,8 +28,9 @@ class NewStop:
         robot, connect, user, credentials = identity(robot, connect, None, tls)
         stop = StopOrder.create(robot, user, name, None, REPLY_WITHIN)
         self._came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
-        at_door = stop.at_door(connect, credentials, self._came.put)
-        self._outcomes = Outcomes(1 if at_door is None else 2)
+        self._at_door = stop.at_door(connect, credentials, self._came.put)
+        self._outcomes = Outcomes(1 if self._at_door is None else 2)
+        self._confirmed = False
         self.opening = threading.Thread(target=self._query, args=(stop, connect, credentials), daemon=True)
         """Thread that opens the session and sends the stop; Zenoh cannot cancel the opening of a session."""
         self.opening.start()
@@ -38,13 +39,17 @@ class NewStop:
         """Return the first reply. Raises RefusedError if the service refuses, ServiceError if there is no reply."""
         while (reply := self._outcomes.decide(self._came.get())) is None:
             pass
+        self._confirmed = True
+        if self._at_door is not None:
+            self._at_door.cancel()
         return reply
 
     def _query(self, stop: StopOrder, connect: str, credentials: Credentials | None) -> None:
         try:
             connection = Connection(stop.robot, connect, credentials)
             try:
-                self._came.put(asyncio.run(_fetch(connection, stop)))
+                if not self._confirmed:  # otherwise the robot may move again
+                    self._came.put(asyncio.run(_fetch(connection, stop)))
             finally:
                 connection.close()
         except TrirailError as error:

@@ -121,7 +121,7 @@ class StopCall:
         self._thread.join()
 
     def cancel(self) -> None:
-        """Make no more attempts to reach the stop port."""
+        """Do not send the stop any more, if it has not been sent yet."""
         self._cancelled.set()
 
     def _run(self) -> None:
@@ -162,6 +162,8 @@ class StopCall:
                 connection = opened.enter_context(
                     secured.wrap_socket(connection, server_hostname=self._address.where[0])
                 )
+            if self._cancelled.is_set():  # the stop is confirmed, and the robot may move again
+                raise StopPortError("the stop is cancelled")
             connection.sendall(self._line)
             connection.settimeout(left)
             heard = b""

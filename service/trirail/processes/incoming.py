@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, KeysView
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import msgspec
 import zenoh
 from msgspec import structs
 
@@ -20,6 +21,19 @@ from trirail.processes.memory_budget import OVERHEAD, Reservation
 from trirail.wire import boundary
 from trirail.wire.packets import GoalRequest
 from trirail.wire.sizes import MAX_UNREAD
+
+
+class StopPair:
+    """Stop with an id, and its copy, which the client sends on the other channel: Zenoh or the stop port."""
+
+    def __init__(self, at_port: bool) -> None:
+        self.at_port = at_port
+        """Whether the first of the two has arrived at the stop port."""
+        self.answer: msgspec.Struct | None = None
+        """Reply to both; None until the stop is answered."""
+        self.answered_at = math.inf
+        self.copy: Incoming | None = None
+        """Copy that waits for the reply."""
 
 
 class Incoming(NamedTuple):
@@ -41,7 +55,7 @@ class Incoming(NamedTuple):
     number: int = 0
     """Sequence number in the order of arrival."""
     id: str = ""
-    """Id of a stop, which is the same in all copies of the stop; "" if the message has no id."""
+    """Id of a stop, which is the same in both copies of the stop; "" if the message has no id."""
     at_door: Callable[[Any], None] | None = None
     """Function that sends the answer to a request at the stop port; None for messages from Zenoh."""
     held: int = 0
@@ -50,6 +64,8 @@ class Incoming(NamedTuple):
     """Reservation of the memory `held`; None if the message is not in the inbox."""
     alike: tuple[Incoming, ...] = ()
     """Equal stops of the same user that were merged into this stop. The stop is carried out once for all of them."""
+    pair: StopPair | None = None
+    """Pair to which a stop with an id belongs, from when the stop is carried out."""
 
     @property
     def user(self) -> str:
@@ -69,7 +85,7 @@ class Incoming(NamedTuple):
 
     def unanswered(self) -> Incoming:
         """Return a copy of the message that will not be answered."""
-        return self._replace(query=None, at_door=None, alike=(), held=len(self.payload) + OVERHEAD)
+        return self._replace(query=None, at_door=None, alike=(), pair=None, held=len(self.payload) + OVERHEAD)
 
 
 BURST = 400

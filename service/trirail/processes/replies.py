@@ -2,8 +2,8 @@
 
 Because of the threads, a client that does not read its replies does not block other clients. A client sends each stop
 both over Zenoh and to the stop port. The service carries the stop out once, and answers both copies with the same
-reply. The slower copy may arrive after the robot has begun to move again. It must not stop goals that were sent after
-the first copy was confirmed.
+reply. The slower copy may arrive shortly after the robot has begun to move again. It must not stop goals that were sent
+after the first copy was confirmed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import msgspec
 import zenoh
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.incoming import Incoming
+from trirail.processes.incoming import Incoming, StopPair
 from trirail.processes.memory_budget import Budget
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.event_codes import EventCode
@@ -28,78 +28,69 @@ from trirail.wire.packets import Announcement, message
 from trirail.wire.sizes import MAX_REFUSED
 from trirail.wire.text import is_name, quoted
 
-REMEMBERED_S = 60.0
-"""Time for which the reply to a stop is stored for later copies [s]. No client waits longer than this for a reply."""
+COPY_WITHIN_S = 2.0
+"""Time after the reply to a stop within which its copy may arrive [s].
+
+A client does not send the second copy after the reply to the first, so only a copy that is on its way is later."""
 COPIES_KEPT = 4096
-"""Maximum number of stored stops. If there are more, the oldest are deleted."""
+"""Maximum number of stops whose copy has not arrived. If there are more, the oldest are deleted."""
 
 _Id = tuple[str, str, bytes]
 
 
-class _Stop:
-    """State of a stop, which is common to all of its copies."""
-
-    def __init__(self, came: float) -> None:
-        self.came = came
-        self.answer: msgspec.Struct | None = None
-        self.waiting: list[Incoming] = []
-
-
 class Copies:
-    """Registry of stops that have arrived. Copies of a stop have the same key, id and content.
+    """Registry of the stops whose copy has not arrived.
 
-    A stop without an id is never regarded as a copy.
+    A stop is a copy if a stop with the same key, id and content has arrived on the other channel and has no copy yet.
+    All other stops are carried out, even if a program uses an id again, or uses no id.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._stops: dict[_Id, _Stop] = {}  # in the order of arrival
+        self._pairs: dict[_Id, StopPair] = {}  # in the order of arrival
 
-    def first(self, incoming: Incoming) -> bool:
-        """Register a stop, and return True if it is the first copy.
+    def first(self, stop: Incoming) -> StopPair | None:
+        """Return the pair of which a stop is the copy, and remove the pair. Return None if the stop is not a copy."""
+        pair = self._pairs.get(_id(stop))
+        if pair is None or pair.at_port == _at_port(stop) or self._is_over(pair):
+            return None
+        return self._pairs.pop(_id(stop))
 
-        The reply to a later copy is `known`, or the copy is stored until the first copy is answered.
+    def add(self, stop: Incoming) -> Incoming:
+        """Register a stop that is not a copy, and return it with its pair. A stop without an id has no copy."""
+        if not stop.id:
+            return stop
+        self._pairs.pop(_id(stop), None)
+        while self._pairs and (len(self._pairs) >= COPIES_KEPT or self._is_over(next(iter(self._pairs.values())))):
+            del self._pairs[next(iter(self._pairs))]
+        self._pairs[_id(stop)] = pair = StopPair(_at_port(stop))
+        return stop._replace(pair=pair)
+
+    def answered(self, stop: Incoming, content: msgspec.Struct) -> Incoming | None:
+        """Store the reply to a stop, and return the copy if it waits for the reply.
+
+        If the stop was refused because the service was busy, a later copy is carried out.
         """
-        if not incoming.id:
-            return True
-        if (stop := self._stops.get(_id(incoming))) is not None:
-            if stop.answer is None:
-                stop.waiting.append(incoming)
-            return False
-        self._forget()
-        self._stops[_id(incoming)] = _Stop(self._clock())
-        return True
+        pair = stop.pair
+        if pair is None:
+            return None
+        pair.answer, pair.answered_at = content, self._clock()
+        busy = isinstance(content, ErrorReply) and content.code == RefusalCode.BUSY
+        if busy and self._pairs.get(_id(stop)) is pair:
+            del self._pairs[_id(stop)]
+        copy, pair.copy = pair.copy, None
+        return copy
 
-    def known(self, incoming: Incoming) -> msgspec.Struct | None:
-        """Return the reply to the first copy of a stop; None if the first copy has not been answered yet."""
-        stop = self._stops.get(_id(incoming))
-        return stop.answer if stop is not None else None
-
-    def answered(self, incoming: Incoming, content: msgspec.Struct) -> list[Incoming]:
-        """Store the reply to a stop, and return the copies that wait for the reply.
-
-        If the stop was refused because the service was busy, delete it, so that a later copy is carried out.
-        """
-        stop = self._stops.get(_id(incoming))
-        if stop is None or stop.answer is not None:
-            return []
-        stop.answer = content
-        if isinstance(content, ErrorReply) and content.code == RefusalCode.BUSY:
-            del self._stops[_id(incoming)]
-        waiting, stop.waiting = stop.waiting, []
-        return waiting
-
-    def _forget(self) -> None:
-        """Delete the oldest stops, if they are older than REMEMBERED_S or there are COPIES_KEPT stops."""
-        while self._stops:
-            name, oldest = next(iter(self._stops.items()))
-            if len(self._stops) < COPIES_KEPT and self._clock() - oldest.came < REMEMBERED_S:
-                return
-            del self._stops[name]
+    def _is_over(self, pair: StopPair) -> bool:
+        return self._clock() - pair.answered_at > COPY_WITHIN_S
 
 
 def _id(stop: Incoming) -> _Id:
     return stop.key, stop.id, stop.payload
+
+
+def _at_port(stop: Incoming) -> bool:
+    return stop.query is None
 
 
 THREADS = 32
@@ -165,7 +156,7 @@ class Replies:
         """Answer a message, the equal messages that were merged into it, and the copies of all of these."""
         for each in (incoming, *incoming.alike):
             self.send(each, content)
-            for copy in self.copies.answered(each, content):
+            if (copy := self.copies.answered(each, content)) is not None:
                 self.send(copy, content)
 
     def without_copies(self, incoming: Incoming) -> Incoming | None:
@@ -176,10 +167,12 @@ class Replies:
         """
         fresh = []
         for each in (incoming, *incoming.alike):
-            if self.copies.first(each):
-                fresh.append(each)
-            elif (known := self.copies.known(each)) is not None:
-                self.send(each, known)
+            if (pair := self.copies.first(each)) is None:
+                fresh.append(self.copies.add(each))
+            elif pair.answer is None:
+                pair.copy = each
+            else:
+                self.send(each, pair.answer)
         if not fresh:
             return None
         return fresh[0]._replace(number=fresh[-1].number, alike=tuple(fresh[1:]))

@@ -36,7 +36,9 @@ class StopRequest(Struct, frozen=True, forbid_unknown_fields=True):
     key: str
     """Key of the query: trirail/<robot>/cmd/<user>/<name>."""
     id: str = ""
-    """Id that all copies of a stop share. The stop is carried out once, and each copy gets a reply."""
+    """Id that a stop shares with its copy over Zenoh; the service carries the stop out once, and replies to both.
+
+    Use a new id for every stop, or none."""
     content: str = ""
     """Content of the command as JSON, as in the payload of the query."""
 
