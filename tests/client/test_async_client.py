@@ -315,3 +315,12 @@ def test_opening_that_is_cancelled_leaves_no_connection(silent: Silent, locator:
 def test_outside_of_its_context_it_says_so() -> None:
     with pytest.raises(ServiceError, match="use the robot within `async with AsyncRobot"):
         asyncio.run(AsyncRobot("demo").enable())
+
+
+@pytest.mark.parametrize("name", ["state", "stop", "info", "users", "enable"])
+def test_another_event_loop_is_told_to_enter_a_robot_of_its_own(silent: Silent, tmp_path: Path, name: str) -> None:
+    robot = AsyncRobot("demo", f"unixsock-stream/{tmp_path}/zenoh")
+    asyncio.run(robot.__aenter__())
+    with pytest.raises(ServiceError, match="another event loop"):
+        asyncio.run(getattr(robot, name)())
+    asyncio.run(robot.close())

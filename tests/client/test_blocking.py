@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import itertools
+import os
 import queue
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, Self
 
 import msgspec
 import pytest
 import zenoh
-from trirail.client.blocking import LoopThread
+from trirail.client import blocking
+from trirail.client.blocking import Jog, Lease, LoopThread
 from trirail.client.client import Robot
 from trirail.errors import ServiceError
 from trirail.wire import zenoh_session
@@ -31,7 +38,8 @@ class Slow:
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
         self.asked: queue.Queue[zenoh.Query] = queue.Queue()
-        keep = zenoh.handlers.Callback(self.asked.put, indirect=False)
+        self.answer: Callable[[zenoh.Query], object] = self.asked.put
+        keep: Any = zenoh.handlers.Callback(lambda query: self.answer(query), indirect=False)  # noqa: PLW0108 - it changes
         self._declared = session.declare_queryable("trirail/demo/**", keep)
 
     def next(self) -> zenoh.Query:
@@ -42,6 +50,28 @@ class Slow:
 def slow(tmp_path: Path) -> Iterator[Slow]:
     with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/zenoh"]) as session:
         yield Slow(session)
+
+
+@pytest.fixture
+def answered(slow: Slow) -> list[str]:
+    """Keys and contents of what is asked, each of which is confirmed at once."""
+    asked: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        kind, *names = str(query.key_expr).split("/")[2:]
+        content = query.payload.to_string() if query.payload is not None else ""
+        asked.append(f"{query.key_expr} {content}")
+        if kind != "goal":
+            reply(query, CommandReply(names[-1], "holding", 1))
+            return
+        goal_id = msgspec.json.decode(content)["id"]
+        reply(query, GoalReply(goal_id, 1.0))
+        if '"kind":"velocity","x":0.0,' in content:  # the end of a jog
+            event = Event("goal", "info", "done", id=goal_id, outcome="done", seq=len(asked), t=0.0, cycle=0, time=1.0)
+            slow.session.put("trirail/demo/event", msgspec.json.encode(event))
+
+    slow.answer = answer
+    return asked
 
 
 @pytest.fixture
@@ -112,7 +142,7 @@ def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str, robo
         held.set()
         free.wait()  # as Zenoh's own send does, in the thread of the event loop
 
-    sending = robot._loop.start(send())
+    robot._loop.start(send())
     assert held.wait(WITHIN)
     stopping = Call(lambda: STOPPING[name](robot))
     try:
@@ -120,7 +150,7 @@ def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str, robo
         assert str(query.key_expr) == f"trirail/demo/cmd/ann/{name}"
         reply(query, CommandReply(name, "holding", 1))
         stopping.end()
-        assert not sending.done()
+        assert not free.is_set()
     finally:
         free.set()
 
@@ -172,6 +202,71 @@ def test_ctrl_c_on_the_way_to_the_first_point_of_a_path_stops_the_robot(robot: R
         assert msgspec.json.decode(stop.payload.to_bytes()) == {"goal": ids[0]}
 
 
+class InterruptedAt:
+    """Raise KeyboardInterrupt in this thread before the line with a number, of those that a call executes."""
+
+    def __init__(self, number: int) -> None:
+        self._left = number
+        self.pressed = False
+
+    def __enter__(self) -> Self:
+        sys.settrace(self._trace)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        sys.settrace(None)
+
+    def _trace(self, frame: FrameType, event: str, _: object) -> Any:
+        called = [each.f_code for each, _ in traceback.walk_stack(frame)]
+        ours = called[0].co_filename == blocking.__file__ or called[0] is Future.result.__code__
+        if not self.pressed and ours and LoopThread.call.__code__ in called:
+            self._left -= event == "line"
+            if self._left < 0:
+                self.pressed = True
+                raise KeyboardInterrupt
+        return self._trace
+
+
+MOVING: dict[str, Callable[[Robot], object]] = {
+    "goal": lambda robot: robot.move_to(0.01, 0.0, 0.0),
+    "path": lambda robot: robot.follow([(0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 0.0, 0.0)]),
+    "jog": lambda robot: held(robot.jog(x=0.01, timeout=0.3)),
+    "lease": lambda robot: held(robot.lease(timeout=0.3)),
+}
+
+
+def held(context: Jog | Lease) -> None:
+    with context:
+        pass
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a coroutine that never began
+@pytest.mark.parametrize("name", MOVING)
+def test_wherever_ctrl_c_interrupts_a_call_nothing_that_it_began_is_left(
+    robot: Robot, answered: list[str], name: str
+) -> None:
+    numbers = itertools.count()
+    pressed = True
+    while pressed:
+        answered.clear()
+        with contextlib.suppress(KeyboardInterrupt), InterruptedAt(next(numbers)) as interrupted:
+            MOVING[name](robot)
+        pressed = interrupted.pressed
+        if pressed and name in ("goal", "path") and answered:
+            wait_until(lambda: "cmd/ann/stop" in answered[-1])
+        wait_until(lambda: not _renewing(robot))
+    assert next(numbers) > 10
+
+
+def _renewing(robot: Robot) -> bool:
+    """Whether the event loop renews anything."""
+
+    async def names() -> set[str]:
+        return {task.get_name() for task in asyncio.all_tasks()}
+
+    return bool(robot._loop.call(names()) & {"jog", "lease"})
+
+
 def test_ctrl_c_ends_a_command_and_the_next_one_is_answered(robot: Robot, slow: Slow) -> None:
     kept: list[zenoh.Query] = []
     interrupt(robot.home, lambda: kept.append(slow.next()))
@@ -199,6 +294,53 @@ def test_ctrl_c_while_it_listens_ends_the_iteration_alone(robot: Robot, slow: Sl
     interrupt(lambda: next(told))
     assert list(told) == []
     assert list(getattr(robot, name)(timeout=0.01)) == []
+
+
+def test_a_signal_handler_may_call_the_robot_wherever_it_interrupts_a_call(robot: Robot, answered: list[str]) -> None:
+    numbers = itertools.count()
+    interrupted = True
+    while interrupted:
+        left = next(numbers)
+        interrupted = False
+
+        def trace(frame: FrameType, event: str, _: object) -> Any:
+            nonlocal left, interrupted
+            called = [each.f_code for each, _ in traceback.walk_stack(frame)]
+            if not interrupted and called[0].co_filename == blocking.__file__ and LoopThread.call.__code__ in called:
+                left -= event == "line"
+                if left < 0:
+                    interrupted = True
+                    sys.settrace(None)
+                    robot.home()
+            return trace
+
+        sys.settrace(trace)
+        try:
+            robot.home()
+        finally:
+            sys.settrace(None)
+    assert next(numbers) > 5
+
+
+@pytest.mark.parametrize("name", ["state", "stop", "move_to", "users", "close"])
+def test_a_forked_process_is_told_to_open_a_robot_of_its_own(robot: Robot, name: str) -> None:
+    arguments = (0.0, 0.0, 0.0) if name == "move_to" else ()
+    codes: list[int] = []
+
+    def ended() -> bool:
+        pid, code = os.waitpid(child, os.WNOHANG)
+        codes.extend([code] if pid else [])
+        return bool(codes)
+
+    child = os.fork()
+    if child == 0:
+        try:
+            getattr(robot, name)(*arguments)
+        except ServiceError as error:
+            os._exit(1 if "open a new one in the forked process" in str(error) else 2)
+        os._exit(0)
+    wait_until(ended)
+    assert codes == [0 if name == "close" else 1 << 8]
 
 
 # ---------------------------------------------------------------------- several threads

@@ -94,7 +94,7 @@ class AsyncRobot:
         except asyncio.CancelledError:  # if the connection opens after the cancellation, close it
             opening.add_done_callback(lambda done: None if done.exception() else done.result().close())
             raise
-        self._opened.push_async_callback(lambda: loop.run_in_executor(None, connection.close))
+        self._opened.push_async_callback(asyncio.to_thread, connection.close)
         await self._use(connection)
         return self
 

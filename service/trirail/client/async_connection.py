@@ -17,6 +17,8 @@ from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.wire.messages import CommandReply, Event, RoleReply
 from trirail.wire.state import State
 
+OTHER_LOOP = "the robot belongs to another event loop: enter a robot in this one, as async with AsyncRobot(…)"
+
 T = TypeVar("T", bound=msgspec.Struct)
 
 
@@ -175,7 +177,13 @@ class AsyncConnection:
                 left.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
 
     def _in_loop(self, deliver: Callable[..., None]) -> Callable[..., None]:
-        """Return a callback for Zenoh's threads that calls `deliver` in the event loop."""
+        """Return a callback for Zenoh's threads that calls `deliver` in the event loop.
+
+        Raises ServiceError in another event loop, and in a forked process.
+        """
+        self._connection.check_process()
+        if asyncio.get_running_loop() is not self._loop:
+            raise ServiceError(OTHER_LOOP)
 
         def deliver_in_loop(*what: object) -> None:
             with contextlib.suppress(RuntimeError):  # the loop is closed, so there is no receiver

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import threading
+import weakref
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import CancelledError, Future
 from typing import Any, Generic, Self, TypeVar
 
-from trirail.client.connection import CLOSED
+from trirail.client.connection import CLOSED, FORKED
 from trirail.client.goal import AsyncGoalHandle, AsyncJog, Result
 from trirail.client.lease import AsyncLease
 from trirail.client.outgoing import seconds
@@ -23,52 +25,102 @@ Held = TypeVar("Held", bound=AsyncJog | AsyncLease | AsyncTrack)
 
 
 CANCELLED_WITHIN = 1.0
-"""Maximum time for which a cancelled call waits for the end of its coroutine [s]."""
+"""Maximum time for which an interrupted call waits until its coroutine has ended or is undone [s]."""
+FROM_CALLBACK = "a function that the robot calls must not call the robot: call it from another thread"
 
 
-async def _wait_for_cancelled() -> None:
-    """Wait until all cancelled tasks of the running event loop have ended."""
-    if cancelled := [task for task in asyncio.all_tasks() if task.cancelling()]:
-        await asyncio.wait(cancelled)
+class _Call(Generic[T]):
+    """Coroutine that the event loop runs for another thread. The result is handed over in `future`, or undone."""
+
+    def __init__(
+        self, coroutine: Coroutine[Any, Any, T], undo: Callable[[], Coroutine[Any, Any, object]] | None = None
+    ) -> None:
+        self.future: Future[T] = Future()
+        self._coroutine = coroutine
+        self._undo = undo
+        self._task: asyncio.Task[T] | None = None
+
+    def start(self) -> None:
+        """Start the coroutine. Call this function in the event loop."""
+        self._task = asyncio.get_running_loop().create_task(self._coroutine)
+        self._task.add_done_callback(self._hand_over)
+
+    def discard(self) -> None:
+        """Close the coroutine, which has not been started."""
+        self._coroutine.close()
+
+    async def abandon(self) -> None:
+        """Cancel the coroutine. If it was not started, or has already ended without an error, undo it."""
+        if self._task is None:
+            self.discard()
+        else:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+            if self._task.cancelled() or self._task.exception() is not None:
+                return
+        if self._undo is not None:
+            await self._undo()
+
+    def _hand_over(self, task: asyncio.Task[T]) -> None:
+        if task.cancelled():
+            self.future.cancel()
+        elif (error := task.exception()) is not None:
+            self.future.set_exception(error)
+        else:
+            self.future.set_result(task.result())
 
 
 class LoopThread:
-    """Separate thread with an event loop that runs coroutines for other threads."""
+    """Separate thread with an event loop that runs coroutines for other threads, and for signal handlers."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a signal handler may call the robot while its thread holds the lock
         self._closed = False
         self._over = asyncio.Event()
+        self._ended: Future[None] = Future()
+        self._process = os.getpid()
         # A daemon, so that a program that never closes its robot still ends.
         self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
         self._thread.start()
 
-    def call(self, coroutine: Coroutine[Any, Any, T]) -> T:
+    def call(
+        self, coroutine: Coroutine[Any, Any, T], undo: Callable[[], Coroutine[Any, Any, object]] | None = None
+    ) -> T:
         """Run a coroutine and return its result. An exception in the waiting thread, such as Ctrl-C, cancels it.
 
-        A cancelled coroutine may still send a stop, so the call waits a short time for its end. Raises ServiceError if
-        the loop is closed before the coroutine ends.
+        If such an exception arrives before the coroutine starts or after it ends, the coroutine function `undo` is run
+        instead, so that the result is either returned or undone. A cancelled coroutine may still send a stop, so the
+        call waits a short time for its end. Raises ServiceError if the loop is closed before the coroutine ends.
         """
-        future = self._submit(coroutine)
+        call = _Call(coroutine, undo)
         try:
-            return future.result()
+            self._submit(call)
+            return call.future.result()
         except CancelledError:
             raise ServiceError(CLOSED) from None
         except BaseException:
-            future.cancel()
-            with contextlib.suppress(TrirailError, TimeoutError, CancelledError):
-                self._submit(_wait_for_cancelled()).result(CANCELLED_WITHIN)
+            if not call.future.done() or call.future.exception() is None:
+                with contextlib.suppress(TrirailError, TimeoutError, CancelledError):
+                    abandoning = _Call(call.abandon())
+                    self._submit(abandoning)
+                    abandoning.future.result(CANCELLED_WITHIN)
             raise
 
-    def start(self, coroutine: Coroutine[Any, Any, object]) -> Future[object]:
-        """Run a coroutine in the background and log its errors. Cancelling the future cancels the coroutine.
+    def start(self, coroutine: Coroutine[Any, Any, object]) -> Callable[[], None]:
+        """Run a coroutine in the background and log its errors. Return a function that cancels the coroutine.
 
         Raises ServiceError if the loop is closed.
         """
-        future = self._submit(coroutine)
-        future.add_done_callback(lambda done: None if done.cancelled() else done.result())
-        return future
+        call = _Call(coroutine)
+        call.future.add_done_callback(lambda done: None if done.cancelled() else done.result())
+        self._submit(call)
+
+        def cancel() -> None:
+            with contextlib.suppress(ServiceError):  # the loop has ended, and the coroutine with it
+                self._submit(_Call(call.abandon()))
+
+        return cancel
 
     def iterate(self, items: AsyncGenerator[T]) -> Iterator[T]:
         """Yield the items of an asynchronous generator; the loop closes it when the caller stops iterating."""
@@ -81,26 +133,33 @@ class LoopThread:
 
     def close(self) -> None:
         """End the running coroutines and the thread."""
+        if os.getpid() != self._process:  # a forked process has no such thread
+            return
         with self._lock:
             if not self._closed:
                 self._closed = True
                 self._loop.call_soon_threadsafe(self._over.set)
-        self._thread.join()
+        self._ended.result()  # unlike Thread.join, it may be interrupted by a signal handler that calls this method
 
-    def _submit(self, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
-        with self._lock:  # the end of the loop also ends every call that was submitted before
-            if self._closed:
-                problem = CLOSED
-            elif threading.current_thread() is self._thread:
-                problem = "a function that the robot calls must not call the robot: call it from another thread"
-            else:
-                return asyncio.run_coroutine_threadsafe(coroutine, self._loop)
-        coroutine.close()
+    def _submit(self, call: _Call[Any]) -> None:
+        """Start a call in the event loop. If that is impossible, discard the call and raise ServiceError."""
+        if os.getpid() != self._process:
+            problem = FORKED
+        elif threading.current_thread() is self._thread:
+            problem = FROM_CALLBACK
+        else:
+            with self._lock:  # the end of the loop also ends every call that was submitted before
+                if not self._closed:
+                    self._loop.call_soon_threadsafe(call.start)
+                    return
+            problem = CLOSED
+        call.discard()
         raise ServiceError(problem)
 
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
             runner.run(self._wait_for_end())
+        self._ended.set_result(None)
 
     async def _wait_for_end(self) -> None:
         await self._over.wait()
@@ -171,19 +230,35 @@ class Blocking(Generic[Held]):
         self._loop = loop
 
     def __enter__(self) -> Self:
-        self._loop.call(self._held.__aenter__())
+        self._loop.call(self._enter(), self._held.__aexit__)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._loop.call(self._held.__aexit__())
+        self._loop.call(self._held.__aexit__(), self._held.__aexit__)
+        self._discarded.detach()
+
+    async def _enter(self) -> None:
+        await self._held.__aenter__()
+        # An exception such as Ctrl-C may prevent the call of __exit__. The context then ends when it is discarded.
+        self._discarded = weakref.finalize(self, _leave, self._held, self._loop)
+        self._discarded.atexit = False
+
+
+def _leave(held: AsyncJog | AsyncLease | AsyncTrack, loop: LoopThread) -> None:
+    """Leave a context without waiting for the robot's rest."""
+    with contextlib.suppress(ServiceError):  # the connection is closed
+        loop.start(held.__aexit__())
 
 
 class Jog(Blocking[AsyncJog]):
     """Context manager that moves the robot at a velocity; `result` is available after the context ends.
 
-    The client renews the jog three times per time-out. The time-out counts real time whatever the override is, so the
-    robot brakes if the program hangs or dies. A pause or a time-out ends a jog; begin a new jog afterwards. Leaving the
-    context makes the robot brake immediately, and waits until the robot is at rest.
+    A thread of the client renews the jog three times per time-out, and the time-out counts real time whatever the
+    override is. If the program dies or loses its connection, the robot brakes. If only the thread that entered the
+    context hangs, the robot continues to move: use Robot.track, which brakes when the program stops calling `update`.
+
+    A pause or a time-out ends a jog; begin a new jog afterwards. Leaving the context makes the robot brake immediately,
+    and waits until the robot is at rest.
 
     Entering the context raises RefusedError if the service refuses the jog. Leaving the context raises TimeoutError if
     the service does not report the jog's end.
@@ -209,8 +284,9 @@ class Lease(Blocking[AsyncLease]):
     """Context manager that holds the lease; `lost` is the error if the lease ends before the context does.
 
     A lease ends early if it is taken over, released or timed out. Entering the context waits until the motions of other
-    users have stopped. If the program hangs or dies, the lease is not renewed; the robot then stops and the lease is
-    released. Leaving the context releases the lease, and waits until the robot is at rest.
+    users have stopped. A thread of the client renews the lease. If the program dies or loses its connection, the robot
+    stops and the lease is released. If only the thread that entered the context hangs, the lease continues. Leaving the
+    context releases the lease, and waits until the robot is at rest.
 
     Entering the context raises RefusedError if another client holds the lease.
     """

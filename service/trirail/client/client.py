@@ -88,7 +88,7 @@ def _goal(
 
     @functools.wraps(method)
     def send(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> GoalHandle:
-        return GoalHandle(robot._loop.call(method(robot._robot, *args, **kwargs)), robot._loop, robot.command)
+        return robot._send(lambda: method(robot._robot, *args, **kwargs))
 
     return _returning(send, GoalHandle)
 
@@ -282,7 +282,7 @@ class Robot:
             "marks": marks,
             "stop_at": stop_at,
         }
-        return GoalHandle(self._loop.call(self._robot.follow(points, **how, id=id)), self._loop, self.command)
+        return self._send(lambda: self._robot.follow(points, **how, id=id))
 
     # ------------------------------------------------------------------ what the service tells
 
@@ -299,6 +299,20 @@ class Robot:
         return self._connection.records(deliver)
 
     # ------------------------------------------------------------------ inside
+
+    def _send(self, send: Callable[[], Coroutine[Any, Any, AsyncGoalHandle]]) -> GoalHandle:
+        """Send a goal and return its handle. If an exception such as Ctrl-C interrupts the call, stop the goal."""
+        sent: list[AsyncGoalHandle] = []
+
+        async def handle() -> GoalHandle:
+            sent.append(await send())
+            return GoalHandle(sent[0], self._loop, self.command)
+
+        async def stop() -> None:
+            for goal in sent:
+                await goal.cancel()
+
+        return self._loop.call(handle(), stop)
 
     async def _converse(
         self, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -34,6 +35,7 @@ HERE_WITHIN = 1.0
 POST_WITHIN = 2.0
 """Time-out of the reply to a posted query [s]."""
 CLOSED = "the connection is closed: open a new one, as Robot(…)"
+FORKED = "the connection belongs to the process that opened it: open a new one in the forked process, as Robot(…)"
 ZENOHS_TIMEOUT = b"Timeout"
 """Content of the error reply with which Zenoh ends a query after the query's time-out."""
 MAX_OVERTAKEN_S = 1.0
@@ -71,8 +73,9 @@ class Connection:
         self._opened = zenoh_session.open_client(connect, credentials)
         # A finalizer also closes the session at the end of a program that does not call `close`. Zenoh's threads must
         # not outlive the interpreter.
-        self.close = weakref.finalize(self, zenoh_session.close, self._opened)
+        self.close = weakref.finalize(self, _close, self._opened, os.getpid())
         """End the session; calls after the first do nothing."""
+        self._process = os.getpid()
         self._reader = SampleReader()
         self._known = 0, 0.0
         self._here = self._opened.liveliness().declare_token(self.key("here", user)) if user is not None else None
@@ -245,7 +248,8 @@ class Connection:
 
     @contextlib.contextmanager
     def open_session(self) -> Iterator[zenoh.Session]:
-        """Yield the Zenoh session. Raises ServiceError if the session is closed, before or within the context."""
+        """Yield the Zenoh session. Raises ServiceError in a forked process, and if the session is or becomes closed."""
+        self.check_process()
         if not self.close.alive:
             raise ServiceError(CLOSED)
         try:
@@ -254,6 +258,11 @@ class Connection:
             if self.close.alive:
                 raise
             raise ServiceError(CLOSED) from error
+
+    def check_process(self) -> None:
+        """Raise ServiceError in a forked process, which has no threads of Zenoh."""
+        if os.getpid() != self._process:
+            raise ServiceError(FORKED)
 
     def _note_sequence(self, message: Message) -> Message:
         """Store the number of the first state that can show a reply's effect or an event; return the message."""
@@ -264,6 +273,11 @@ class Connection:
 
     def _known_is_old(self) -> bool:
         return time.monotonic() - self._known[1] > MAX_OVERTAKEN_S
+
+
+def _close(session: zenoh.Session, process: int) -> None:
+    if os.getpid() == process:
+        zenoh_session.close(session)
 
 
 def _ignore(_reply: zenoh.Reply) -> None:

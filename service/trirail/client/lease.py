@@ -59,13 +59,14 @@ class AsyncLease:
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        if self._over.is_set():
+            return
         self._over.set()
         if self._keeping is not None:
             self._keeping.cancel()
             await asyncio.wait([self._keeping])
-        if self.lost is None:
-            with contextlib.suppress(TrirailError):  # without a reply, the time-out ends the lease
-                await self._command(Command.RELEASE, msgspec.json.encode(ReleaseLease(self._sign.id)))
+        with contextlib.suppress(TrirailError):  # without a reply, the time-out ends the lease
+            await self._command(Command.RELEASE, msgspec.json.encode(ReleaseLease(self._sign.id)))
 
     async def _keep(self) -> None:
         sign, now = msgspec.json.encode(self._sign), asyncio.get_running_loop().time

@@ -8,7 +8,7 @@ import itertools
 import threading
 import time
 from collections import deque
-from concurrent.futures import Future
+from collections.abc import Callable
 from contextlib import aclosing
 
 import msgspec
@@ -63,7 +63,7 @@ class Feed:
         self._alignment_events: list[tuple[int, bytes]] = []
         """Events of the latest alignment, which are stored even after MAX_EVENTS later events."""
         self._alignment = ("", "")
-        self._subscriptions: list[Future[object]] = []
+        self._subscriptions: list[Callable[[], None]] = []
         self._is_described = True
         """Whether the service has answered with its description since it was last silent."""
 
@@ -75,8 +75,8 @@ class Feed:
 
     def close(self) -> None:
         """Stop the subscriptions."""
-        for subscription in self._subscriptions:
-            subscription.cancel()
+        for cancel in self._subscriptions:
+            cancel()
 
     def events(self, after: int) -> list[tuple[int, bytes]]:
         """Return the numbers and the JSON of the events with numbers higher than `after`, in order of arrival."""
