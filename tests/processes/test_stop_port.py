@@ -7,6 +7,7 @@ import itertools
 import os
 import resource
 import socket
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,6 +15,8 @@ import msgspec
 import pytest
 from certificates import service_port, tls_config, user
 from control_rig import CONFIG
+from hypothesis import given
+from hypothesis import strategies as st
 from trirail.client.stop_call import Outcome, StopCall, StopOrder, StopPortError
 from trirail.config import Config, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
@@ -26,7 +29,7 @@ from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
 from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopAddress, StopRequest, stop_address
 from trirail.wire.vocabulary import Command
-from waiting import WITHIN
+from waiting import WITHIN, wait_until
 
 DONE = CommandReply("stop", "holding", 1)
 PLACES = 64
@@ -142,6 +145,25 @@ def test_junk_is_refused_or_let_go_and_the_next_is_heard(plain: Opened, line: by
             assert b"reply" not in junk.recv(MAX_LINE)
     assert call(locator) == DONE
     assert len(asked.requests) == 1
+
+
+@given(cut=st.integers(0, 100), newline=st.booleans())
+def test_who_sends_no_more_is_answered_all_the_same(cut: int, newline: bool) -> None:
+    """As `nc -N` does. A line without its end is a request as well, if it is whole."""
+    request = msgspec.json.encode(StopRequest("trirail/demo/cmd/ann/stop"))
+    line = request[: len(request) - cut]
+    folder = tempfile.TemporaryDirectory()
+    config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=(f"unixsock-stream/{folder.name}/z",)))
+    with folder, contextlib.contextmanager(opened)(config) as (locator, asked), connected(locator) as calling:
+        asked.held = []
+        calling.sendall(line + b"\n" * newline)
+        calling.shutdown(socket.SHUT_WR)
+        if whole := not cut:
+            wait_until(lambda: bool(asked.held))
+            asked.held.pop()(DONE)
+        answer = calling.recv(MAX_LINE)
+    assert (b'"reply"' in answer) == whole
+    assert (b"malformed" in answer) == (not whole and bool(line or newline))
 
 
 def silent(connection: socket.socket, number: int) -> None:

@@ -209,14 +209,19 @@ class StopPort:
         while b"\n" not in heard:
             if len(heard) > MAX_LINE:
                 raise ConnectionError
-            heard += await self._receive(caller)
+            data = await self._receive(caller)
+            if not data and not heard:
+                raise ConnectionError
+            if not data:  # the client has finished sending, so the line is complete
+                break
+            heard += data
         return heard.partition(b"\n")[0], user
 
     async def _receive(self, caller: _Caller) -> bytes:
-        """Return the next data from a connection. Raises ConnectionError if the client has disconnected."""
+        """Return the next data from a connection; b"" if the client sends no more, but may still read."""
         data = await self._when_readable(caller, lambda: caller.connection.recv(MAX_LINE))
         if not data:
-            raise ConnectionError
+            self._loop.remove_reader(caller.number)  # the connection remains readable
         return data
 
     async def _when_readable(self, caller: _Caller, act: Callable[[], T]) -> T:
@@ -241,7 +246,7 @@ class StopPort:
     async def _answer(self, caller: _Caller, user: str, line: bytes) -> CommandReply | ErrorReply:
         """Forward a request and return the answer.
 
-        Raises ConnectionError if the client disconnects or sends further data before the answer.
+        Raises OSError if the connection breaks or the client sends further data before the answer.
         """
         try:
             request = decoded(line, StopRequest)
@@ -265,9 +270,9 @@ class StopPort:
         more = self._loop.create_task(self._receive(caller))
         try:
             await asyncio.wait((answered, more), return_when=asyncio.FIRST_COMPLETED)
-            if not answered.done():
+            if not answered.done() and more.result():
                 raise ConnectionError
-            return answered.result()
+            return await answered
         finally:
             more.cancel()
             await asyncio.gather(more, return_exceptions=True)
