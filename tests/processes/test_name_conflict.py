@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 import zenoh
 from control_rig import CONFIG
@@ -22,11 +23,13 @@ from trirail.wire import zenoh_session
 from trirail.wire.event_codes import EventCode
 from trirail.wire.messages import Notice
 from trirail.wire.packets import Announcement, CommandRequest, GoalRequest
+from trirail.wire.records import DTYPE
 from waiting import wait_until
 
 GOAL = b'{"kind": "pose", "x": 0, "y": 0, "phi": 0}'
 REFUSED = (("goal/ann", GOAL), ("cmd/ann/enable", b""), ("cmd/ann/home", b""), ("cmd/ann/resume", b""),
-           ("cmd/ann/set_output", b'{"output": "valve", "value": true}'))  # fmt: skip
+           ("cmd/ann/set_output", b'{"output": "valve", "value": true}'),
+           ("cmd/ann/override", b'{"percent": 101}'))  # fmt: skip
 STOPS = ("stop", "quick_stop", "disable", "pause")
 
 
@@ -110,13 +113,16 @@ def test_neither_of_two_services_of_one_name_moves_but_both_stop(
     second = Service(tmp_path, router.locator, "second")
     for service in (first, second):
         wait_until(service.knows)
+        service.gateway._states.records(np.zeros(1, DTYPE))  # the override is 100 %
         for key, content in REFUSED:
             service.send(key, content)
         assert [notice.code for notice in service.announced()] == [RefusalCode.NAME_IN_USE] * len(REFUSED)
         assert not [request for request in service.link.sent if isinstance(request, GoalRequest | CommandRequest)]
         for name in STOPS:
             service.send(f"cmd/ann/{name}")
-        assert [request.name for request in service.link.sent if isinstance(request, CommandRequest)] == list(STOPS)
+        service.send("cmd/ann/override", b'{"percent": 0}')
+        passed = [request.name for request in service.link.sent if isinstance(request, CommandRequest)]
+        assert passed == [*STOPS, "override"]
         service.link.sent.clear()
         (warning,) = service.at(GRACE_S)
         assert service.at(GRACE_S + 100.0) == (warning,)

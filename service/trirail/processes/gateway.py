@@ -58,7 +58,7 @@ from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_PART
 from trirail.wire.state import summary_of
 from trirail.wire.text import quoted
-from trirail.wire.vocabulary import Mode, NoContent
+from trirail.wire.vocabulary import Command, Mode, NoContent, Override
 
 SWITCH_EVERY = 0.0005
 """Interval after which a thread yields the interpreter [s], short enough for Zenoh's threads to deliver messages."""
@@ -218,9 +218,18 @@ class Gateway:
 
     def _command(self, message: RoutedMessage) -> None:
         _, command = message.names
-        if command in REFUSED:
+        override = command == Command.OVERRIDE and self._name_conflict.exists
+        if command in REFUSED or (override and self._is_faster(message.incoming)):
             self._name_conflict.check(command)
         self._commands.read(message.incoming, *message.names)
+
+    def _is_faster(self, override: Incoming) -> bool:
+        """Return True if an override is higher than the present one. An invalid override is not."""
+        try:
+            content: Override = override.content(Override, "not an override")
+        except RefusedError:
+            return False
+        return content.percent > self._states.newest().override * 100.0
 
     def _forward_look(self, message: RoutedMessage) -> AlignmentLook:
         (user,) = message.names

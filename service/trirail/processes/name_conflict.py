@@ -32,7 +32,9 @@ GRACE_S: Final = 12.0
 The other service may be an earlier run that lost its connection. Its token stays until Zenoh's lease of 10 s ends.
 """
 REFUSED: Final = frozenset({Command.ENABLE, Command.HOME, Command.RESUME, Command.SET_OUTPUT})
-"""Commands that are refused while another service has the same robot name, because they would act on both robots."""
+"""Commands that are refused while another service has the same robot name, because they would act on both robots.
+
+A speed override is refused as well if it is higher than the present one."""
 _REMEDY = "give each robot its own [robot] name; a service that lost its connection disappears after 10 s"
 
 
@@ -88,8 +90,8 @@ class NameConflict:
             self._warning = ""
         elif not self._warning and now >= self._grace_ends:
             words = (
-                f"robot name {self._robot}: another service in this Zenoh network has the same name; goals, enable and "
-                f"home are refused; {_REMEDY}"
+                f"robot name {self._robot}: another service in this Zenoh network has the same name; goals, "
+                f"{', '.join(sorted(REFUSED))} and a higher override are refused; {_REMEDY}"
             )
             text = coded(words, EventCode.NAME_IN_USE, robot=self._robot)
             self._announce(Notice("service", "error", text.text, **text.fields))
@@ -99,9 +101,14 @@ class NameConflict:
         """Return the warning that another service has the same robot name, if there is one."""
         return (self._warning,) if self._warning else ()
 
+    @property
+    def exists(self) -> bool:
+        """Whether another service has the same robot name."""
+        return bool(self._tokens)
+
     def check(self, request: str) -> None:
         """Raise RefusedError if a request, such as "a goal", would act on the robot of another service too."""
-        if self._tokens:
+        if self.exists:
             problem = (
                 f"robot name {self._robot}: another service in this Zenoh network has the same name; {request} would "
                 f"act on both robots; {_REMEDY}"
