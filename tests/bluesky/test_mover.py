@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 from trirail.bluesky import UnfinishedError
 from trirail.bluesky.flight import Flight
-from trirail.bluesky.mover import AxisMove, Mover
+from trirail.bluesky.mover import AxisMove, Mover, setpoint_of
 from trirail.client.async_client import AsyncRobot
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
@@ -22,8 +22,16 @@ class State:
     """What a mover reads of a state."""
 
     def __init__(self, pose: Pose, seq: int = 1) -> None:
-        self.pose, self.seq, self.goal = pose, seq, None
+        self.pose, self.seq = pose, seq
+        self.goal: Going | None = None
         self.commanded = self
+
+
+class Going:
+    """A goal in progress, of another client."""
+
+    def __init__(self, target: Pose | None) -> None:
+        self.target = target
 
 
 class Robot:
@@ -31,6 +39,7 @@ class Robot:
 
     def __init__(self) -> None:
         self.pose = Pose(0.0, 0.0, 0.0)
+        self.going: Going | None = None
         self.goals: list[AsyncGoalHandle] = []
         self.targets: list[tuple[float, float, float]] = []
         self.accepts = asyncio.Event()
@@ -39,7 +48,9 @@ class Robot:
         self.told: asyncio.Queue[State | Exception] = asyncio.Queue()
 
     async def state(self) -> State:
-        return State(self.pose)
+        state = State(self.pose)
+        state.goal = self.going
+        return state
 
     async def states(self, timeout: float | None = None) -> AsyncGenerator[State]:
         while True:
@@ -292,5 +303,20 @@ def test_a_flight_that_is_stopped_while_its_path_is_sent_does_not_fly() -> None:
         await begun
         with pytest.raises(TrirailError, match="stopped"):
             await flight.complete()
+
+    run(work)
+
+
+@pytest.mark.parametrize("target", [None, Pose(0.1, 0.2, 0.3)])
+def test_a_set_of_one_axis_leaves_the_others_at_the_setpoints_that_locate_tells(target: Pose | None) -> None:
+    async def work(robot: Robot, mover: Mover) -> None:
+        robot.pose, robot.going = Pose(1.0, 2.0, 3.0), Going(target)
+        move = mover.start({0: 0.5})
+        await until(lambda: bool(robot.goals))
+        setpoint = setpoint_of(cast(Any, await robot.state()))
+        assert robot.targets == [(0.5, setpoint.y, setpoint.phi)]
+        assert setpoint == (target or robot.pose)
+        robot.end("done")
+        assert await outcome(move) == ""
 
     run(work)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from trirail.client.async_client import AsyncRobot
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
-from trirail.wire.state import Pose
+from trirail.wire.state import Pose, State
 
 GATHERING_S = 0.005
 """Time after a set during which other sets join its goal [s]. Sets of a message group arrive within a millisecond."""
@@ -183,7 +183,7 @@ class Mover:
     async def _send_goal(self, moves: list[AxisMove], before: _Motion | None) -> _Motion:
         """Send a goal for new sets, and for the sets in progress with axes that the new sets do not move."""
         carried: list[AxisMove] = []
-        pose = (await self._robot.state()).commanded.pose
+        pose = setpoint_of(await self._robot.state())
         if before is not None and before.goal.result is None:
             # Move the sets of other axes to the new goal before it is sent. When the service accepts the new goal, the
             # earlier goal ends, and with it the sets that remain with it.
@@ -213,6 +213,12 @@ class Mover:
                     return ServiceError("the service has restarted: the end of the goal is unknown")
                 cycle, self.pose = state.seq, state.pose
         return ServiceError(f"no state of the robot for {SILENCE_S:g} s: the end of the goal is unknown")
+
+
+def setpoint_of(state: State) -> Pose:
+    """Return the target of the goal in progress; the commanded pose if there is no goal or the goal has no target."""
+    target = state.goal.target if state.goal is not None else None
+    return target or state.commanded.pose
 
 
 def end_all(moves: list[AxisMove], error: Exception | None) -> None:

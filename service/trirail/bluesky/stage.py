@@ -16,7 +16,7 @@ from ophyd_async.core import AsyncLocatable, AsyncReadable, WatchableAsyncStatus
 
 from trirail.bluesky.flight import Flight
 from trirail.bluesky.monitor import Monitored, Readings
-from trirail.bluesky.mover import Mover
+from trirail.bluesky.mover import Mover, setpoint_of
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.client.trajectory import Points, points_of
@@ -229,7 +229,7 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         The setpoint is the target of the goal in progress; if there is no goal, it is the commanded value.
         """
         state = await (await self._stage.link()).robot.state()
-        return Location(setpoint=self._value(_setpoint(state)), readback=self._value(state.pose))
+        return Location(setpoint=self._value(setpoint_of(state)), readback=self._value(state.pose))
 
     @WatchableAsyncStatus.wrap
     async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:
@@ -280,7 +280,7 @@ class MovableAxis(_Movable[float]):
 
     async def check_value(self, value: float) -> None:
         """Check the path to a value; see Stage.check. The other coordinates are at their setpoints, as in `locate`."""
-        pose = list(_setpoint(await (await self._stage.link()).robot.state()))
+        pose = list(setpoint_of(await (await self._stage.link()).robot.state()))
         pose[self._index] = float(value)
         await self._stage.check(pose)
 
@@ -307,9 +307,3 @@ class MovablePose(_Movable[NDArray[np.float64]]):
 
     def _value(self, pose: Pose) -> NDArray[np.float64]:
         return np.array(pose)
-
-
-def _setpoint(state: State) -> Pose:
-    """Return the target of the goal in progress; the commanded pose if there is no goal or the goal has no target."""
-    target = state.goal.target if state.goal is not None else None
-    return target or state.commanded.pose

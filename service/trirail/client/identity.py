@@ -19,14 +19,17 @@ def identity(
 ) -> tuple[str, str, str, Credentials | None]:
     """Return the robot's name, the locator, the user's name and the credentials of a client.
 
-    Missing arguments are replaced by TRIRAIL_ROBOT, TRIRAIL_CONNECT and the login name. Raises RefusedError if a name
-    is invalid or is not the certificate's name, and ServiceError for invalid credentials.
+    Arguments that are None are replaced by TRIRAIL_ROBOT, TRIRAIL_CONNECT and the login name. Raises RefusedError if a
+    name is invalid or is not the certificate's name, and ServiceError for invalid credentials.
     """
-    robot = check_name(robot or os.environ.get("TRIRAIL_ROBOT") or "demo", "robot")
-    connect = connect or os.environ.get("TRIRAIL_CONNECT") or DEFAULT_LOCATOR
+    if robot is None:
+        robot = os.environ.get("TRIRAIL_ROBOT") or "demo"
+    if connect is None:
+        connect = os.environ.get("TRIRAIL_CONNECT") or DEFAULT_LOCATOR
+    check_name(robot, "robot")
     credentials = credentials_for(robot, connect, tls)
     known_as = credentials.name if credentials is not None else ""
-    name = check_name(user or known_as or _user(), "user")
+    name = check_name((known_as or _user()) if user is None else user, "user")
     if credentials is not None and known_as != name:
         whose = f"in the name of {quoted(known_as)}" if known_as else "without a common name"
         problem = f"the certificate in {credentials.folder} is {whose}: it cannot be used to send as {name}"
