@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 import zenoh
 from refusals import refused_as
@@ -17,7 +18,8 @@ from trirail.client.async_client import AsyncRobot
 from trirail.client.client import GoalHandle, Robot
 from trirail.client.goal import AsyncGoalHandle
 from trirail.errors import RefusalCode, ServiceError, WaitTimeoutError
-from trirail.wire.messages import Event
+from trirail.wire.messages import CommandReply, Event
+from trirail.wire.records import DTYPE
 from trirail.wire.zenoh_session import open_service
 from waiting import WITHIN
 
@@ -145,3 +147,50 @@ def test_the_environment_says_which_robot_and_where_as_in_a_shell(
     monkeypatch.setenv("TRIRAIL_TLS", str(tmp_path / "keys"))
     with pytest.raises(ServiceError, match=f"{tmp_path}/keys/ca.pem"):
         kind("left")
+
+
+@pytest.mark.parametrize("argument", ["name", "user"])
+def test_an_empty_name_selects_no_other_robot_or_user(monkeypatch: pytest.MonkeyPatch, argument: str) -> None:
+    monkeypatch.setenv("TRIRAIL_ROBOT", "another")
+    with refused_as(RefusalCode.BAD_NAME):
+        AsyncRobot(**{argument: ""})
+
+
+def test_a_callback_of_records_cannot_wait_for_the_robot(tmp_path: Path) -> None:
+    locator = f"unixsock-stream/{tmp_path}/zenoh"
+    errors: list[str] = []
+
+    def deliver(_: bytes) -> None:
+        try:
+            robot.state()
+        except ServiceError as error:
+            errors.append(str(error))
+
+    with open_service([locator]) as session, Robot("demo", locator) as robot, robot.records(deliver):
+        while not errors:
+            session.put("trirail/demo/records", np.zeros(1, DTYPE).tobytes())
+    assert "must not call the robot" in errors[0]
+
+
+def test_the_users_of_a_robot_that_is_not_there_are_an_error(tmp_path: Path) -> None:
+    locator = f"unixsock-stream/{tmp_path}/zenoh"
+    with open_service([locator]), Robot("demo", locator) as robot, pytest.raises(ServiceError, match="no robot 'demo'"):
+        robot.users()
+
+
+def test_a_stop_with_any_content_goes_out(tmp_path: Path) -> None:
+    locator = f"unixsock-stream/{tmp_path}/zenoh"
+    contents: list[bytes] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            contents.append(query.payload.to_bytes() if query.payload is not None else b"")
+            query.reply(query.key_expr, msgspec.json.encode(CommandReply("stop", "holding", 1)))
+
+    with (
+        open_service([locator]) as session,
+        session.declare_queryable("trirail/demo/**", answer),
+        Robot("demo", locator) as robot,
+    ):
+        robot.command("stop", b"\xff")
+    assert contents == [b"\xff"]

@@ -600,8 +600,11 @@ class AsyncRobot:
         return None if role is None else Role(role)
 
     async def users(self) -> list[str]:
-        """Return the names of the users who are connected to the robot, including this user."""
-        return await self._connection.users()
+        """Return the names of the users who are connected to the robot, including this user.
+
+        Raises RefusedError `not_allowed` if this user has no role.
+        """
+        return await self._connection.users(self.user)
 
     async def poses(self) -> dict[str, NamedPose]:
         """Return the poses of the configuration and the taught poses, by name."""

@@ -75,8 +75,15 @@ class AsyncConnection:
                 unreadable = answer
         raise unreadable or await self.nobody(*parts)
 
-    async def users(self) -> list[str]:
-        """Return the names of the users who have a session to this robot."""
+    async def users(self, user: str) -> list[str]:
+        """Return the names of the users who have a session to this robot.
+
+        A session always sees its own user. So that a robot that does not exist, or `user` without a role, is an error,
+        the role is queried first. Raises the same errors as `fetch`.
+        """
+        role = await self.fetch(("role", user), RoleReply)
+        if role.role is None:
+            raise self._connection.why_nobody(("here", user), role)
         key = self._connection.key("here", "*")
         get = self._replies(lambda session: session.liveliness().get, key_expr=key, timeout=HERE_WITHIN)
         async with aclosing(get) as here:

@@ -29,6 +29,23 @@ CANCELLED_WITHIN = 1.0
 FROM_CALLBACK = "a function that the robot calls must not call the robot: call it from another thread"
 
 
+_callback = threading.local()
+"""Whether the thread is calling a function of the program, for which the connection waits."""
+
+
+def callback(deliver: Callable[[bytes], None]) -> Callable[[bytes], None]:
+    """Return a function that calls `deliver`, and in which calls of the robot raise ServiceError."""
+
+    def call(data: bytes) -> None:
+        _callback.runs = True
+        try:
+            deliver(data)
+        finally:
+            _callback.runs = False
+
+    return call
+
+
 class _Call(Generic[T]):
     """Coroutine that the event loop runs for another thread. The result is handed over in `future`, or undone."""
 
@@ -145,7 +162,7 @@ class LoopThread:
         """Start a call in the event loop. If that is impossible, discard the call and raise ServiceError."""
         if os.getpid() != self._process:
             problem = FORKED
-        elif threading.current_thread() is self._thread:
+        elif threading.current_thread() is self._thread or getattr(_callback, "runs", False):
             problem = FROM_CALLBACK
         else:
             with self._lock:  # the end of the loop also ends every call that was submitted before

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, ca
 import zenoh
 
 from trirail.client.async_client import AsyncRobot
-from trirail.client.blocking import GoalHandle, Jog, Lease, LoopThread, Track
+from trirail.client.blocking import GoalHandle, Jog, Lease, LoopThread, Track, callback
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.client.trajectory import Points, points_of
 from trirail.errors import TrirailError
@@ -294,9 +294,9 @@ class Robot:
         """Call `deliver` with every batch of records until the returned subscriber is closed.
 
         trirail.wire.records.unpack decodes a batch. A thread of the connection calls `deliver`, which must return
-        quickly.
+        quickly and must not call the robot.
         """
-        return self._connection.records(deliver)
+        return self._connection.records(callback(deliver))
 
     # ------------------------------------------------------------------ inside
 

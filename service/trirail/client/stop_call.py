@@ -66,7 +66,7 @@ class StopOrder(NamedTuple):
         Return None, without sending, if the locator has no stop port or the message is too long for the port.
         """
         address = stop_address(locator)
-        content = (self.content or b"").decode()
+        content = (self.content or b"").decode(errors="replace")
         line = encode(StopRequest(zenoh_session.key(self.robot, *self.parts), self.id, content))
         if address is None or len(line) > MAX_LINE:
             return None
