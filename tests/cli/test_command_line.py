@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +32,7 @@ from trirail.wire.goal_kind import GoalKind, field_description
 from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.messages import GoalReply
 from trirail.wire.state import NamedPose
+from waiting import WITHIN
 
 Run = Callable[..., tuple[int, str, str]]
 NOBODY = "tcp/127.0.0.1:1"
@@ -623,3 +625,56 @@ def test_what_a_command_opens_never_has_the_number_of_a_closed_standard_stream()
     )
     ended = subprocess.run(["sh", "-c", '"$0" -c "$1" <&- >&- 2>&-', sys.executable, opens], check=False)
     assert ended.returncode == 3
+
+
+class Endless(Slow):
+    """A robot whose goal does not end before it is cancelled, and that sends no state."""
+
+    def __init__(self) -> None:
+        super().__init__(1.0)
+        self.ended, self.stopped = threading.Event(), self.result
+        self.result = None  # type: ignore[assignment]
+
+    def cancel(self) -> None:
+        self.result = self.stopped
+        self.ended.set()
+
+    def __exit__(self, *_: object) -> None:
+        self.cancel()
+
+    def states(self, timeout: float) -> Iterator[SimpleNamespace]:
+        assert self.ended.wait(WITHIN)
+        yield SimpleNamespace(goal=None, seq=1)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("line", ["goto 0 0 0 --wait", "move 0 0 0 --wait", "sliders 0 0 0 --wait", "jog 0.01 0 0"])
+def test_a_signal_that_ends_the_command_stops_the_robot_first(
+    monkeypatch: pytest.MonkeyPatch, line: str, number: signal.Signals
+) -> None:
+    robot = Endless()
+
+    def states(_timeout: float) -> Iterator[SimpleNamespace]:
+        signal.raise_signal(number)
+        yield SimpleNamespace(goal=None, seq=1)
+
+    monkeypatch.setattr(robot, "states", states)
+    monkeypatch.setattr(client, "Robot", lambda *_, **__: robot)
+    monkeypatch.setattr(live, "table", lambda *_: "")
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
+    monkeypatch.setattr(sys, "argv", ["trirail", *line.split()])
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        with pytest.raises(SystemExit) as exited:
+            app.main()
+    finally:
+        signal.signal(number, before)
+    assert robot.ended.is_set()
+    assert exited.value.code == 128 + number
+
+
+def test_a_jog_ends_after_its_time_even_if_no_state_comes(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Endless()
+    monkeypatch.setattr(live, "table", lambda *_: "")
+    monkeypatch.setattr(client, "Robot", lambda *_, **__: robot)
+    assert run("jog", "0.01", "0", "0", "--seconds", "0.05") == (0, "goal g-1 done\n", "")

@@ -282,13 +282,9 @@ def help_(*command: str) -> int:
 help_pages.arrange(app)
 
 
-class Terminated(BaseException):
-    """SIGTERM or SIGHUP asked this process to end. As after Ctrl-C, the command releases its lease and drives."""
-
-
 def _terminated(number: int, _frame: FrameType | None) -> None:
     signal.signal(number, signal.SIG_IGN)  # timeout(1) sends it twice, which would interrupt the exit
-    raise Terminated
+    raise terminal.Terminated(number)
 
 
 def main() -> None:
@@ -313,8 +309,8 @@ def main() -> None:
         code = 1
     except KeyboardInterrupt:
         code = 130
-    except Terminated:
-        code = 143
+    except terminal.Terminated as terminated:
+        code = 128 + terminated.number
     except BrokenPipeError:  # the reader, such as head, has closed the pipe
         sys.stderr.close()
         code = 0

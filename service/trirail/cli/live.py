@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -26,7 +27,7 @@ from trirail.cli.terminal import (
     plain,
     print_line,
 )
-from trirail.errors import ServiceError
+from trirail.errors import ServiceError, TrirailError
 from trirail.naming import Labels
 from trirail.wire.decoding import converted
 from trirail.wire.state import GoalState, Info, State
@@ -79,15 +80,32 @@ def _print_once_a_second(robot: Robot) -> None:
             print_line(f"{state.t:.2f} s  {state.mode}  {notation.pose(state.pose)}{goal}{faults}")
 
 
-def show_jog(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
-    """Show the pose during a jog until the jog ends or its time has elapsed."""
-    labels = robot.info().labels
-    ends = math.inf if seconds is None else time.monotonic() + seconds
+@contextlib.contextmanager
+def ending(jog: Jog, seconds: float | None) -> Iterator[None]:
+    """End a jog after a time, even if no state arrives; without a time, do nothing."""
+
+    def end() -> None:
+        with contextlib.suppress(TrirailError):  # the program leaves the context as well, and gets the error
+            jog.__exit__()
+
+    if seconds is None:
+        yield
+        return
+    timer = threading.Timer(seconds, end)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def show_jog(robot: Robot, jog: Jog, labels: Labels, *, show: bool = True) -> None:
+    """Show the pose during a jog until the jog ends."""
     with Live(console=out, refresh_per_second=10, transient=True) as live:
         for state in robot.states(SERVICE_TIMEOUT_S):
             if show:
                 live.update(table(state, robot.name, labels))
-            if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
+            if jog.error is not None or jog.result is not None:
                 return
     raise ServiceError("the service no longer sends its state")
 

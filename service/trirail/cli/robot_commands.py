@@ -213,10 +213,11 @@ def jog(
         raise CycloptsError(msg="jog takes VX, VY and W, or none of them: then keys move the robot while they are held")
     with service.open() as robot:
         jogging = robot.jog(x=vx, y=vy, phi=w, tool=tool)
-        with contextlib.suppress(KeyboardInterrupt), jogging:
+        labels = robot.info().labels
+        with contextlib.suppress(KeyboardInterrupt), jogging, live.ending(jogging, seconds):
             if not service.json and jogging.reply is not None and (words := terminal.slowed(jogging.reply)):
                 terminal.print_error(words)
-            live.show_jog(robot, jogging, seconds, show=not service.json)
+            live.show_jog(robot, jogging, labels, show=not service.json)
         if jogging.error is not None:
             raise jogging.error
         reply, result = jogging.reply, jogging.result

@@ -41,6 +41,14 @@ SERVICE_TIMEOUT_S = 3.0
 """Time without an answer after which the service counts as gone [s]."""
 
 
+class Terminated(BaseException):
+    """Signal that asks this process to end. As after Ctrl-C, the command stops its goal and releases its lease."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
 def plain(words: str) -> str:
     """Return external text for the console, without markup, control characters or line breaks."""
     return escape(printable(words))
@@ -157,7 +165,10 @@ def measuring(title: str, *, show: bool = True) -> Iterator[Callable[[float], No
 
 
 def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> Result:
-    """Wait for the end of a goal and show its progress. Ctrl-C stops the goal; a second Ctrl-C raises ServiceError."""
+    """Wait for the end of a goal and show its progress.
+
+    Ctrl-C stops the goal; a second Ctrl-C raises ServiceError. Terminated also stops the goal, and is raised again.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -187,6 +198,9 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
             # In another thread, so that a second Ctrl-C takes effect immediately.
             threading.Thread(target=_cancel, args=(goal,), name="cancel", daemon=True).start()
             progress.update(task, description="stopping; Ctrl-C again leaves")
+        except Terminated:
+            _cancel(goal)
+            raise
         try:
             return wait_for_end()
         except KeyboardInterrupt as second:
