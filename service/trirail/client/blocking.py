@@ -26,7 +26,6 @@ Held = TypeVar("Held", bound=AsyncJog | AsyncLease | AsyncTrack)
 
 CANCELLED_WITHIN = 1.0
 """Maximum time for which an interrupted call waits until its coroutine has ended or is undone [s]."""
-FROM_CALLBACK = "a function that the robot calls must not call the robot: call it from another thread"
 
 
 _callback = threading.local()
@@ -60,7 +59,7 @@ class _Call(Generic[T]):
     def start(self) -> None:
         """Start the coroutine. Call this function in the event loop."""
         self._task = asyncio.get_running_loop().create_task(self._coroutine)
-        self._task.add_done_callback(self._hand_over)
+        self._task.add_done_callback(self._set_outcome)
 
     def discard(self) -> None:
         """Close the coroutine, which has not been started."""
@@ -78,7 +77,7 @@ class _Call(Generic[T]):
         if self._undo is not None:
             await self._undo()
 
-    def _hand_over(self, task: asyncio.Task[T]) -> None:
+    def _set_outcome(self, task: asyncio.Task[T]) -> None:
         if task.cancelled():
             self.future.cancel()
         elif (error := task.exception()) is not None:
@@ -163,7 +162,7 @@ class LoopThread:
         if os.getpid() != self._process:
             problem = FORKED
         elif threading.current_thread() is self._thread or getattr(_callback, "runs", False):
-            problem = FROM_CALLBACK
+            problem = "a function that the robot calls must not call the robot: call it from another thread"
         else:
             with self._lock:  # the end of the loop also ends every call that was submitted before
                 if not self._closed:

@@ -24,7 +24,7 @@ from trirail.processes.incoming import Incoming
 from trirail.processes.loop_death import LoopDeath
 from trirail.processes.memory_budget import HeapTrim
 from trirail.processes.monitoring import Meter
-from trirail.processes.name_conflict import REFUSED, NameConflict
+from trirail.processes.name_conflict import REFUSED, REFUSED_IF_HIGHER, NameConflict
 from trirail.processes.order import Order
 from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications, StateMaker, info
@@ -58,7 +58,7 @@ from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_PART
 from trirail.wire.state import summary_of
 from trirail.wire.text import quoted
-from trirail.wire.vocabulary import Command, Mode, NoContent, Override
+from trirail.wire.vocabulary import Mode, NoContent, Override
 
 SWITCH_EVERY = 0.0005
 """Interval after which a thread yields the interpreter [s], short enough for Zenoh's threads to deliver messages."""
@@ -218,7 +218,7 @@ class Gateway:
 
     def _command(self, message: RoutedMessage) -> None:
         _, command = message.names
-        override = command == Command.OVERRIDE and self._name_conflict.exists
+        override = command in REFUSED_IF_HIGHER and self._name_conflict.exists
         if command in REFUSED or (override and self._is_faster(message.incoming)):
             self._name_conflict.check(command)
         self._commands.read(message.incoming, *message.names)

@@ -32,9 +32,9 @@ GRACE_S: Final = 12.0
 The other service may be an earlier run that lost its connection. Its token stays until Zenoh's lease of 10 s ends.
 """
 REFUSED: Final = frozenset({Command.ENABLE, Command.HOME, Command.RESUME, Command.SET_OUTPUT})
-"""Commands that are refused while another service has the same robot name, because they would act on both robots.
-
-A speed override is refused as well if it is higher than the present one."""
+"""Commands that are refused while another service has the same robot name, because they would act on both robots."""
+REFUSED_IF_HIGHER: Final = frozenset({Command.OVERRIDE})
+"""Commands that are refused in the same case if their value is higher than the present one."""
 _REMEDY = "give each robot its own [robot] name; a service that lost its connection disappears after 10 s"
 
 
@@ -90,8 +90,8 @@ class NameConflict:
             self._warning = ""
         elif not self._warning and now >= self._grace_ends:
             words = (
-                f"robot name {self._robot}: another service in this Zenoh network has the same name; goals, "
-                f"{', '.join(sorted(REFUSED))} and a higher override are refused; {_REMEDY}"
+                f"robot name {self._robot}: another service in this Zenoh network has the same name; goals, enable, "
+                f"home, resume, set_output and a higher override are refused; {_REMEDY}"
             )
             text = coded(words, EventCode.NAME_IN_USE, robot=self._robot)
             self._announce(Notice("service", "error", text.text, **text.fields))
