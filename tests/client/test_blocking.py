@@ -433,3 +433,27 @@ def test_after_closing_every_call_says_so_and_no_thread_is_left(robot: Robot, sl
     for call in (robot.state, robot.enable, goal.wait, goal.cancel, lambda: next(robot.states()), robot.users):
         with pytest.raises(ServiceError, match=CLOSED):
             call()
+
+
+@pytest.mark.parametrize("in_loop", [False, True])
+def test_a_context_that_is_discarded_ends_whichever_thread_discards_it(in_loop: bool) -> None:
+    ended = threading.Event()
+
+    class Held:
+        async def __aenter__(self) -> None: ...
+
+        async def __aexit__(self, *_: object) -> None:
+            ended.set()
+
+    held: Any = Held()
+    with contextlib.closing(LoopThread()) as loop:
+        contexts = [Jog(held, loop).__enter__()]
+
+        async def discard() -> None:
+            contexts.clear()
+
+        if in_loop:
+            loop.start(discard())
+        else:
+            contexts.clear()
+        assert ended.wait(WITHIN)

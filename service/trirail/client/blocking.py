@@ -110,6 +110,9 @@ class LoopThread:
         call waits a short time for its end. Raises ServiceError if the loop is closed before the coroutine ends.
         """
         call = _Call(coroutine, undo)
+        if threading.current_thread() is self._thread or getattr(_callback, "runs", False):
+            call.discard()
+            raise ServiceError("a function that the robot calls must not call the robot: call it from another thread")
         try:
             self._submit(call)
             return call.future.result()
@@ -161,8 +164,6 @@ class LoopThread:
         """Start a call in the event loop. If that is impossible, discard the call and raise ServiceError."""
         if os.getpid() != self._process:
             problem = FORKED
-        elif threading.current_thread() is self._thread or getattr(_callback, "runs", False):
-            problem = "a function that the robot calls must not call the robot: call it from another thread"
         else:
             with self._lock:  # the end of the loop also ends every call that was submitted before
                 if not self._closed:
