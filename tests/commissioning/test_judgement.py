@@ -18,7 +18,7 @@ from trirail.commissioning.coupling import (
     judge_push,
 )
 from trirail.commissioning.guide import merge_changes
-from trirail.commissioning.judgement import Judgement, judge_square, judge_switches, judge_watchdog
+from trirail.commissioning.judgement import Judgement, judge_homing, judge_square, judge_switches, judge_watchdog
 from trirail.commissioning.moves import TEST_DISTANCE_M
 from trirail.commissioning.report import CommissioningReport, format_lines
 from trirail_drivers.config import Drives
@@ -275,3 +275,13 @@ def test_the_values_of_another_drive_are_told_to_the_last_digit(counts: int) -> 
     if counts != given.A.counts_per_metre:
         assert f"drives.A.counts_per_metre = {counts}, not 1000000" in judged.remedy
         assert f"drives.A.counts_per_metre should be {counts}" in format_lines(report)
+
+
+@given(slider=sliders, offset=st.floats(-0.5, 0.5), beyond=st.floats(-0.1, 0.1), confirmed=st.booleans())
+def test_a_position_away_from_the_configured_home_is_pointed_out(
+    slider: str, offset: float, beyond: float, confirmed: bool
+) -> None:
+    assume(abs(abs(beyond) - 0.001) > 1e-9)
+    judgement = judge_homing(slider, None, offset + beyond, offset, confirmed, "")
+    assert judgement.verdict == ("ok" if confirmed else "wrong")
+    assert any(f"drives.{slider}.offset" in words for words in judgement.words) == (abs(beyond) > 0.001)

@@ -18,7 +18,7 @@ from rigs import STANDSTILL, Closing, Cycles, alike
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
 from trirail_drivers.cia402.drives import Cia402
-from trirail_drivers.cia402.objects import FOLLOWING_BIT, PROTECTIONS, USES
+from trirail_drivers.cia402.objects import FOLLOWING_BIT, USES
 from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple
@@ -216,7 +216,7 @@ def test_what_another_master_has_left_in_a_drive_does_not_disturb_the_cycle(
 def test_a_drive_that_keeps_a_sync_of_another_kind_is_refused(closing: Closing, index: int) -> None:
     kind = 5 if index == 0x1019 else 7
     rig = closing(Rig("elmo_gold", Habits(without=frozenset({index}), more=((index, 0, kind, "ro", 0x81, False),))))
-    with pytest.raises(DriveError, match=f"drive A: object {index:04X}:00 .* stays .*; expected 0"):
+    with pytest.raises(DriveError, match=f"drive A: cannot write 0.* to object {index:04X}:00 .*; it keeps "):
         rig.ready()
 
 
@@ -308,7 +308,7 @@ def test_a_segment_that_is_not_answered_is_aborted_by_its_object(
     assert aborts == {bytes.fromhex("80 00 10 00 00 00 04 05")}
 
 
-LACKABLE = [name for name in PROTECTIONS if name not in ("1016", FOLLOWING_BIT)]
+LACKABLE = [name for name, use in USES.items() if use.need == "protection" and name != "1016"]
 """Protections whose place nothing takes; for 1016 there is guarding."""
 
 

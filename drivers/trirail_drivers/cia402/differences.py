@@ -60,10 +60,26 @@ class Differences:
                 refusal = error
                 continue
             return candidate
-        if refusal is None:
-            return current
         self.lack(key, f"it keeps {shown(*key, current) if current is not None else 'what it has'}", refusal)
         return None
+
+    async def ensure_at_most(self, key: Key, limit: int) -> None:
+        """Write `limit` to an object with a higher value. Any value up to `limit` may be read back."""
+        current = await self.remote.peek(*key)
+        if current is None or current <= limit:
+            return
+        try:
+            await self.remote.write(*key, limit)
+        except SdoRefused as refusal:
+            self.lack(key, f"it keeps {shown(*key, current)}", refusal)
+            return
+        held, waited = await self.remote.wait_until(key, lambda held: held <= limit)
+        if held is None or held <= limit:
+            self.note(key, current, limit)
+            return
+        name = self.remote.name_of(key)
+        values = shown(*key, limit), shown(*key, held)
+        self.lack(key, f"it keeps {values[1]}", ConfigurationRefused(self.remote.name, name, *key, *values, waited))
 
     async def try_ensure(self, key: Key, value: int) -> bool:
         """Write an object unless it already has the value; return whether the drive accepts the value."""
@@ -107,24 +123,26 @@ class Differences:
             )
         )
 
-    def lack(self, key: Key, reason: str, refusal: SdoRefused | None = None) -> None:
-        """Handle a missing object or a refused value, depending on the driver's need for the object.
+    def lack(self, key: Key, reason: str, refusal: DriveError | None = None) -> None:
+        """Handle a missing object or, with its `refusal`, an object that keeps another value.
 
         Raise an error if the object is needed, record a protection as missing, and otherwise add a note.
         """
         named = find_use(key)
-        if named is None or named[1].need is Need.NEEDED:
+        used = named[1] if named else None
+        need, without = (Need.NEEDED, "") if not used else used.if_kept if refusal else (used.need, used.without)
+        if named is None or used is None or need is Need.NEEDED:
+            purpose = f"needed for {used.purpose}" if used else ""
             if refusal is not None:
+                refusal.args = ("; ".join(filter(None, (str(refusal), reason, purpose))),)
                 raise refusal
-            purpose = f", needed for {named[1].purpose}" if named else ""
-            raise DriveError(f"drive {self.remote.name}: lacks {title(key)}{purpose}")
-        name, used = named
+            raise DriveError(", ".join(filter(None, (f"drive {self.remote.name}: lacks {title(key)}", purpose))))
         if refusal is not None:
             reason = f"{reason}: {str(refusal).partition(': ')[2]}"
-        if used.need is Need.PROTECTION:
-            self.missing_protections[name] = reason
+        if need is Need.PROTECTION:
+            self.missing_protections[named[0]] = reason
         else:
-            self.add_note(f"{title(key)}, for {used.purpose}: {reason}; instead: {used.without}")
+            self.add_note(f"{title(key)}, for {used.purpose}: {reason}; instead: {without}")
 
     def add_note(self, text: str) -> None:
         """Add a note about a deviation, unless it has already been added."""

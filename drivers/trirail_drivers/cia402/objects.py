@@ -2,7 +2,8 @@
 
 Manufacturers omit objects that are optional in CiA 301 and CiA 402-2. A drive without a NEEDED object is refused. For a
 REPLACEABLE object the driver uses a substitute and adds a note. Without a PROTECTION, the drive would not stop in a
-situation in which this service promises a stop, so the drive is refused unless `accept_without` names the object.
+situation in which this service promises a stop, so the drive is refused unless `accept_without` names the object. An
+object that exists but keeps another value may have another consequence than a missing one, whose default is known.
 """
 
 from __future__ import annotations
@@ -32,26 +33,42 @@ class ObjectUse(NamedTuple):
     purpose: str
     without: str
     """Substitute for the object, or consequence of lacking it."""
+    kept: tuple[Need, str] | None = None
+    """Need and consequence if the drive has the object but keeps another value; None if both are as without it."""
+
+    @property
+    def if_kept(self) -> tuple[Need, str]:
+        """Need and consequence if the drive has the object but keeps another value."""
+        return self.kept or (self.need, self.without)
 
 
 _N, _R, _P = Need.NEEDED, Need.REPLACEABLE, Need.PROTECTION
+_REFUSED: Final = _N, "refused"
 
 USES: Final = {
     "1000": ObjectUse(_N, "Device type", "check that it is a CiA 402 drive", "refused"),
     "1001": ObjectUse(_R, "Error register", "check that an EMCY is over", "only EMCY 00xxh shows it"),
-    "1005": ObjectUse(_R, "COB-ID SYNC", "reception of SYNC 080h", "080h, the predefined one"),
+    "1005": ObjectUse(_R, "COB-ID SYNC", "reception of SYNC 080h", "080h, the predefined one", _REFUSED),
     "1006": ObjectUse(_P, "Communication cycle period", "its monitoring of SYNC", "it continues without SYNC"),
-    "1007": ObjectUse(_R, "Synchronous window length", "setpoints accepted at any time", "there is none"),
+    "1007": ObjectUse(_R, "Synchronous window length", "setpoints accepted at any time", "there is none", _REFUSED),
     "100C": ObjectUse(_R, "Guard time", "node guarding, without 1016", "heartbeats"),
     "100D": ObjectUse(_R, "Life time factor", "node guarding, without 1016", "heartbeats"),
     "1014": ObjectUse(_R, "COB-ID EMCY", "its EMCY", "080h + node, the predefined one"),
-    "1015": ObjectUse(_R, "Inhibit time EMCY", "an EMCY without delay", "it is assumed to be 0"),
+    "1015": ObjectUse(_R, "Inhibit time EMCY", "an EMCY without delay", "there is none", (_R, "delayed EMCYs")),
     "1016": ObjectUse(_P, "Consumer heartbeat time", "its monitoring of this service", "node guarding 100Ch, or none"),
     "1017": ObjectUse(_R, "Producer heartbeat time", "monitoring by this service", "only its answers to SYNC"),
-    "1019": ObjectUse(_R, "Synchronous counter overflow", "SYNC without a counter", "there is none"),
-    "1029": ObjectUse(_R, "Error behaviour", "pre-operational without a master", "the standard's default, the same"),
+    "1019": ObjectUse(_R, "Synchronous counter overflow", "SYNC without a counter", "there is none", _REFUSED),
+    "1029": ObjectUse(
+        _R,
+        "Error behaviour",
+        "pre-operational without a master",
+        "the standard's default, the same",
+        (_P, "only its reaction 6007"),
+    ),
     "1400:05": ObjectUse(_R, "Event timer", "no deadline for controlwords", "there is none"),
-    "1800:03": ObjectUse(_R, "Inhibit time", "a statusword without delay", "there is none"),
+    "1800:03": ObjectUse(
+        _R, "Inhibit time", "a statusword without delay", "there is none", (_R, "delayed statuswords")
+    ),
     "1800:05": ObjectUse(_R, "Event timer", "repeated statuswords", "beside the position, or polled"),
     "6007": ObjectUse(_P, "Abort connection option code", "its stop without a master", "its own reaction"),
     "603F": ObjectUse(_R, "Error code", "the cause of a fault at the start", "only its EMCY shows it"),
@@ -63,8 +80,11 @@ USES: Final = {
     "6061": ObjectUse(_N, "Modes of operation display", "the mode", "refused"),
     "6064": ObjectUse(_N, "Position actual value", "its position", "refused"),
     "6065": ObjectUse(_P, "Following error window", "its own monitoring of the following error", "only this service's"),
+    "6066": ObjectUse(
+        _R, "Following error time out", "its reaction within 100 ms", "there is none", (_P, "a later reaction")
+    ),
     "607A": ObjectUse(_N, "Target position", "setpoints of mode 8", "refused"),
-    "607C": ObjectUse(_R, "Home offset", "home at `offset`", "0, the standard's default"),
+    "607C": ObjectUse(_R, "Home offset", "home at `offset`", "0, the standard's default", _REFUSED),
     "6085": ObjectUse(_P, "Quick stop deceleration", "its quick-stop ramp", "its own ramp"),
     "6098": ObjectUse(_N, "Homing method", "homing, where configured", "refused"),
     "6099": ObjectUse(_N, "Homing speeds", "homing, where configured", "refused"),
@@ -86,7 +106,9 @@ USES: Final = {
 
 FOLLOWING_BIT: Final = "6041"
 """Name in `accept_without` that allows a drive never to set bit 12 of its statusword."""
-PROTECTIONS: Final = {name: used for name, used in USES.items() if used.need is Need.PROTECTION} | {
+PROTECTIONS: Final = {
+    name: used._replace(without=used.if_kept[1]) for name, used in USES.items() if used.if_kept[0] is Need.PROTECTION
+} | {
     FOLLOWING_BIT: ObjectUse(
         _P, "Bit 12 of the statusword", "its report that it follows setpoints", "that is not checked"
     )

@@ -29,6 +29,8 @@ INVALID: Final = 1 << 31
 """Bit of a PDO's COB-ID that marks the PDO as not used."""
 NO_REMOTE_REQUEST: Final = 1 << 30
 """Bit of a TPDO's COB-ID that excludes remote requests. Some drives always report this bit, others never do."""
+_SYNC_BITS: Final = 0x6000_07FF
+"""Bits of 1005h: generation of SYNC, extended frames, and identifier. CiA 301 does not define bit 31."""
 _BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x60FD, 0x60FE, 0x6502)
 
 
@@ -307,6 +309,9 @@ def shown(index: int, subindex: int, value: int) -> str:  # noqa: ARG001
 
 def same(index: int, subindex: int, one: int, other: int) -> bool:
     """Whether two values of an object are equivalent for this service."""
-    # Bit 30 of a PDO's COB-ID, which states whether remote requests are answered, is irrelevant here.
-    ignored = NO_REMOTE_REQUEST if is_pdo(index) and not index & 0x200 and subindex == 1 else 0
-    return one | ignored == other | ignored
+    relevant = -1
+    if is_pdo(index) and not index & 0x200 and subindex == 1:
+        relevant = ~NO_REMOTE_REQUEST  # whether remote requests are answered
+    elif index == 0x1005:
+        relevant = _SYNC_BITS
+    return not (one ^ other) & relevant

@@ -8,7 +8,7 @@ from typing import Final
 
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import Key, title
-from trirail_drivers.cia402.sdo import SdoRefused, shown
+from trirail_drivers.cia402.sdo import SdoRefused, same
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives, Homing
 from trirail_drivers.errors import ConfigurationRefused, DriveError
@@ -61,34 +61,30 @@ def heartbeat_period_ms(drives: Drives) -> int:
 
 async def configure_cycle_period(drive: Differences, period: float) -> None:
     """Configure the cycle period [s] (1006h, 60C2h), and a SYNC without extras (1005h, 1007h, 1019h)."""
-    for key, wanted, bits in PLAIN_SYNC:
-        await _configure_sync(drive, key, wanted, bits)
+    for key, wanted in PLAIN_SYNC:
+        await _configure_sync(drive, key, wanted)
     await drive.ensure(0x1006, 0, round(1e6 * period))
     await _configure_interpolation(drive, interpolation_periods(period))
 
 
 PLAIN_SYNC: Final = (
-    ((0x1005, 0), 0x80, 0x4000_07FF),  # bit 30: the drive would send SYNC itself
-    ((0x1007, 0), 0, 0xFFFF_FFFF),  # setpoints and positions outside this window are dropped
-    ((0x1019, 0), 0, 0xFF),  # a drive that expects a counter answers a SYNC without one with EMCY 8240h
+    ((0x1005, 0), 0x80),  # bit 30: the drive would send SYNC itself
+    ((0x1007, 0), 0),  # setpoints and positions outside this window are dropped
+    ((0x1019, 0), 0),  # a drive that expects a counter answers a SYNC without one with EMCY 8240h
 )
-"""SYNC objects that another master may have changed; each with its key, the required value, and the relevant bits."""
+"""SYNC objects that another master may have changed, and their required values."""
 
 
-async def _configure_sync(drive: Differences, key: Key, wanted: int, bits: int) -> None:
+async def _configure_sync(drive: Differences, key: Key, wanted: int) -> None:
     remote = drive.remote
     current = await remote.peek(*key)
-    if current is None or current & bits == wanted:
+    if current is None or same(*key, current, wanted):
         return
     if key == (0x1019, 0) and await remote.peek(0x1006):
         with suppress(SdoRefused):
             await remote.write(0x1006, 0, 0)  # CiA 301: the counter may change only while the period is 0
             await remote.wait_until((0x1006, 0), lambda held: held == 0)
     await drive.ensure(*key, wanted)
-    if (await remote.peek(*key) or 0) & bits != wanted:
-        raise DriveError(
-            f"drive {remote.name}: {title(key)} stays {shown(*key, current)}; expected {shown(*key, wanted)}"
-        )
 
 
 async def _configure_interpolation(drive: Differences, periods: list[tuple[int, int]]) -> None:
@@ -144,9 +140,7 @@ async def configure_reactions(drive: Differences, drives: Drives, units: Units) 
     else:
         drive.lack((0x6085, 0), "it has no such object")
     await drive.ensure(0x6065, 0, units.length(name, "following_error", drives.following_error))
-    held = await drive.remote.peek(0x6066)
-    if held is not None and held > MAX_FOLLOWING_TIMEOUT_MS:
-        await drive.put((0x6066, 0), held, MAX_FOLLOWING_TIMEOUT_MS, "a prompt reaction to a following error")
+    await drive.ensure_at_most((0x6066, 0), MAX_FOLLOWING_TIMEOUT_MS)
 
 
 async def configure_homing(drive: Differences, homing: Homing, units: Units) -> None:

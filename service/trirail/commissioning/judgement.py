@@ -19,6 +19,8 @@ Changes = Mapping[str, int | float]
 SWITCHES: Final = {1: "negative limit switch", 2: "positive limit switch", 4: "home switch"}
 """Names of the switches by their bits in the digital inputs 60FDh (CiA 402-2)."""
 LIMIT_BITS: Final = (1, 2)
+MAX_HOME_DEVIATION: Final = 0.001
+"""Distance from home beyond which the position after homing is pointed out [m]."""
 HEARTBEAT_MISSING: Final = 0x8130
 """EMCY error code for a life guard or heartbeat error (CiA 301, emergency error codes)."""
 
@@ -80,12 +82,18 @@ def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: 
 
 
 def judge_homing(
-    drive: str, travel: float | None, position: float, confirmed: bool, stopped: str, labels: Labels = NAMES
+    drive: str,
+    travel: float | None,
+    position: float,
+    offset: float,
+    confirmed: bool,
+    stopped: str,
+    labels: Labels = NAMES,
 ) -> Judgement:
     """Judge a homing that ended at `position` [m] after `travel` [m], which is None if nothing measured it.
 
-    `confirmed` is True if the person confirmed that the slider is at its home switch. `stopped` is the reason why the
-    drives were stopped, or "".
+    `offset` is the configured position of home [m]. `confirmed` is True if the person confirmed that the slider is at
+    its home switch. `stopped` is the reason why the drives were stopped, or "".
     """
     slider = f"slider {label(drive, labels)}"
     if stopped:
@@ -96,6 +104,11 @@ def judge_homing(
         )
     moved = "" if travel is None else f"moved {format_mm(travel)} and "
     words = (f"drive {drive} reports home; {slider} {moved}is at {format_mm(position)}",)
+    if abs(position - offset) > MAX_HOME_DEVIATION:
+        words = (
+            *words,
+            f"but drives.{drive}.offset = {format_mm(offset)}: right only if the slider stopped so far beyond home",
+        )
     if confirmed:
         return Judgement("ok", words)
     return Judgement(

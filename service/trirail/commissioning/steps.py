@@ -187,7 +187,8 @@ class Steps:
     def home(self, name: str) -> StepOutcome:
         """Home one drive while only this drive is enabled."""
         bench, index = self.session.bench(), NAMES.index(name)
-        homing = self._config.drives.each[index].homing
+        drive = self._config.drives.each[index]
+        homing = drive.homing
         if homing is None:
             return Judgement("ok", ("no homing: its encoder is absolute",)), {}
         stopped, rules = "", self._observer.read_rules()
@@ -204,7 +205,7 @@ class Steps:
         confirmed = stopped or self._observer.ask_yes_no(
             f"Did slider {self.slider_label(name)} stop at its home switch?"
         )
-        judgement = judge_homing(name, travel, position, bool(confirmed), stopped, self._labels)
+        judgement = judge_homing(name, travel, position, drive.offset, bool(confirmed), stopped, self._labels)
         return judgement, {"way": travel, "position": position, "stopped": stopped}
 
     def watchdog(self, name: str) -> StepOutcome:
