@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
+from canopen import SdoAbortedError
 from drivers.foreign import Habits
+from drivers.test_backup import Line
 from drivers.test_foreign import PERIOD, Rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
 from rigs import Closing
+from trirail_drivers.cia402 import inspection
+from trirail_drivers.cia402.eds import SERVO
+from trirail_drivers.cia402.objects import title
+from trirail_drivers.cia402.one_drive import SetUp
+from trirail_drivers.cia402.setup import check_identifiers, survey
+from trirail_drivers.config import Homing
+from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
+from trirail_drivers.simulated.dictionary import ObjectEntry
 
 Key = tuple[int, int]
 MASTER = 126
@@ -100,3 +115,230 @@ def test_a_mapping_that_fits_with_another_transmission_type_says_so(closing: Clo
     said = r"1601 = 607A0020h, which fits, but its transmission type 1401:02 stays 255; expected 1"
     with pytest.raises(DriveError, match=said):
         rig.drives.configure(PERIOD)
+
+
+HOMING = Homing(method=37, speed_switch=0.01, speed_zero=0.001, acceleration=0.1)
+KEEPS: dict[Key, tuple[str, int]] = {
+    (0x1005, 0): ("refused", 0x81),
+    (0x1007, 0): ("refused", 500),
+    (0x607C, 0): ("refused", 5000),
+    (0x1029, 1): ("protection", 1),
+    (0x6066, 0): ("protection", 500),
+    (0x1800, 3): ("noted", 50),
+    (0x609A, 0): ("noted", 7),
+}
+"""What becomes of a drive with an object of another value than the set-up needs, and such a value."""
+
+
+def fit(line: Line, key: Key, value: int) -> ObjectEntry:
+    """Have drive A hold a value in an object that its dictionary may lack, and set up its homing."""
+    line.drives = replace(line.drives, A=replace(line.drives.A, homing=HOMING))
+    entry = line.objects[key]
+    entry.value = value
+    return entry
+
+
+def set_up(line: Line, *, apply: bool) -> dict[str, object]:
+    """What the set-up of drive A finds, or why it is refused."""
+    nothing: dict[str, object] = {"notes": [], "lacking": [], "differences": []}
+    try:
+        return nothing | inspection.inspect(line.bus, line.drives, 0.001, line.clock, 0.2, apply=apply)[0]
+    except DriveError as error:
+        return nothing | {"refused": str(error)}
+
+
+@pytest.mark.parametrize("apply", [False, True])
+@pytest.mark.parametrize("key", KEEPS)
+def test_a_value_that_a_drive_keeps_is_not_told_as_a_missing_object(key: Key, apply: bool) -> None:
+    end, value = KEEPS[key]
+    with Line(SERVO) as line:
+        fit(line, key, value)._limits = None  # it is read-only
+        found = set_up(line, apply=apply)
+    refused, notes = str(found["refused"]), [str(each) for each in found["notes"]]  # type: ignore[attr-defined]
+    if end == "noted":
+        (note,) = [each for each in notes if each.startswith(title(key))]
+        assert not refused
+        assert str(value) in note
+        assert "there is none" not in note
+        return
+    assert not any(title(key) in each for each in notes)
+    assert ("lacks protections" in refused) == (end == "protection")
+    assert f"{key[0]:04X}" in refused
+    if end == "protection":
+        with Line(SERVO) as line:
+            fit(line, key, value)._limits = None
+            line.drives = replace(line.drives, A=replace(line.drives.A, accept_without=(f"{key[0]:04X}",)))
+            assert set_up(line, apply=apply)["lacking"] == [f"{key[0]:04X}"]
+
+
+@settings(max_examples=20)
+@given(held=st.integers(0, 0xFFFF), step=st.integers(1, 300), keeps=st.booleans())
+def test_any_time_out_of_the_following_error_up_to_100_ms_is_accepted(held: int, step: int, keeps: bool) -> None:
+    """A drive may round the time down to a multiple of its own cycle, or keep what it has."""
+
+    def write(entry: ObjectEntry, old: int) -> None:
+        entry.value = old if keeps else entry.value // step * step
+
+    with Line(SERVO) as line:
+        fit(line, (0x6066, 0), held).on_write = write
+        refused, now = set_up(line, apply=True)["refused"], line.objects[0x6066, 0].value
+    assert now <= 100 or "6066" in str(refused)
+    assert not refused or now > 100
+
+
+@pytest.mark.parametrize("identifier", [0x80, 0x81, 0x4000_0080, 0x2000_0080])
+def test_bit_31_of_the_identifier_of_sync_means_nothing(identifier: int) -> None:
+    with Line(SERVO) as line:
+        entry = line.objects[0x1005, 0]
+        entry._limits = None, None
+
+        def keep_bit(entry: ObjectEntry, old: int) -> None:
+            if old & 0x4000_0000 and entry.value & 0x7FF != old & 0x7FF:
+                raise SdoAbortedError(0x0609_0030)
+            entry.value |= 0x8000_0000
+
+        entry.value, entry.on_write = 0x8000_0000 | identifier, keep_bit
+        assert not set_up(line, apply=True)["refused"]
+        assert entry.value == 0x8000_0080
+
+
+def keep_on(entry: ObjectEntry, old: int) -> None:
+    """Ignore a write of the identifier, as a drive that stays on does."""
+    if entry.subindex == 1:
+        entry.value = old
+
+
+def map_pdo(line: Line, index: int, identifier: int, kind: int, *entries: int) -> None:
+    """Map a PDO of drive A as its manufacturer would."""
+    objects = line.objects
+    objects[index, 1].write(1 << 31 | identifier)
+    objects[index + 0x200, 0].write(0)
+    for position, entry in enumerate(entries, start=1):
+        objects[index + 0x200, position].write(entry)
+    objects[index + 0x200, 0].write(len(entries))
+    objects[index, 2].write(kind)
+    objects[index, 1].write(identifier)
+
+
+@pytest.mark.parametrize("ignores", [False, True])
+@pytest.mark.parametrize("apply", [False, True])
+@settings(max_examples=25)
+@given(
+    identifier=st.one_of(
+        st.sampled_from([0x181, 0x182, 0x202, 0x281, 0x282, 0x301, 0x303, 0x201, 0x82, 0x401]),
+        st.integers(0x181, 0x57F),
+    ),
+)
+def test_a_pdo_that_stays_on_shares_no_identifier_with_a_used_one(ignores: bool, apply: bool, identifier: int) -> None:
+    used = {each + node for each in (0x80, 0x180, 0x200, 0x280, 0x300) for node in (1, 2, 3)}
+    with Line(SERVO) as line:
+        map_pdo(line, 0x1402, identifier, 1, 0x607A_0020)
+        if ignores:
+            line.objects[0x1402, 1].on_write = keep_on
+        else:
+            line.objects[0x1402, 1]._limits = None
+        found = set_up(line, apply=apply)
+    refused, notes = str(found["refused"]), str(found["notes"])
+    if ignores and not apply:
+        return  # only a write shows it
+    if identifier in used:
+        assert f"identifier {identifier:03X}h, which cannot be changed" in refused
+    else:
+        assert not refused
+        assert "PDO 1402 cannot be switched off" in notes
+        assert not [each for each in found["differences"] if each["object"] == "1402:01"]  # type: ignore[attr-defined]
+
+
+def mapping_of(line: Line, index: int) -> list[int]:
+    """What the parameters of a PDO hold."""
+    objects = line.objects
+    keys = [(index, 1), (index, 2), *((index + 0x200, position) for position in range(9))]
+    return [objects[key].value for key in keys]
+
+
+@pytest.mark.parametrize("apply", [False, True])
+@settings(max_examples=25)
+@given(
+    fixed=st.sampled_from(["entries are read-only", "other entries are refused", "no entry is accepted"]),
+    entries=st.sampled_from([(0x6040_0010, 0x607A_0020), (0x607A_0020,), (0x607A_0020, 0x6040_0010)]),
+    identifier=st.integers(0x301, 0x57F).filter(lambda each: each not in (0x302, 0x303)),
+    kind=st.sampled_from([0, 1, 255]),
+)
+def test_a_mapping_that_a_drive_does_not_change_is_used_as_it_was(
+    apply: bool, fixed: str, entries: tuple[int, ...], identifier: int, kind: int
+) -> None:
+    def refuse(entry: ObjectEntry, old: int) -> None:
+        suits = entry.subindex <= len(entries) and entry.value == (0, *entries)[entry.subindex]
+        if fixed == "no entry is accepted" or not suits:
+            raise SdoAbortedError(0x0604_0041)
+
+    with Line(SERVO) as line:
+        map_pdo(line, 0x1401, identifier, kind, *entries)
+        for position in range(1, 9):
+            if fixed == "entries are read-only":
+                line.objects[0x1601, position]._limits = None
+            else:
+                line.objects[0x1601, position].on_write = refuse
+        before = mapping_of(line, 0x1401)
+        found = set_up(line, apply=apply)
+        after = mapping_of(line, 0x1401)
+    assert not found["refused"]
+    if entries == (0x607A_0020,):
+        assert after[2:] == before[2:]
+    elif apply and (entries[0] != 0x607A_0020 or fixed != "other entries are refused"):
+        assert after == [before[0], 1, *before[2:]]
+        assert any("PDO 1401 is used as it is mapped" in str(each) for each in found["notes"])  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("apply", [False, True])
+@pytest.mark.parametrize("access", ["read-only", "writable"])
+@pytest.mark.parametrize("mappable", [False, True])
+@pytest.mark.parametrize("inhibit", [0, 50, 200, 201, 5000])
+def test_an_inhibit_time_costs_no_pdo(inhibit: int, mappable: bool, access: str, apply: bool) -> None:
+    with Line(SERVO) as line:
+        objects = line.objects
+        if not mappable:
+            map_pdo(line, 0x1801, 0x281, 1, 0x6064_0020)
+            for index in (0x1A00, 0x1A01):
+                for position in range(9):
+                    objects[index, position]._limits = None
+        objects[0x1800, 3].value = inhibit
+        if access == "read-only":
+            objects[0x1800, 3]._limits = None
+        found = set_up(line, apply=apply)
+        cob_id, held = objects[0x1800, 1].value, objects[0x1800, 3].value
+        assert not found["refused"]
+        kept = access == "read-only" and inhibit != 0
+        way = str(found["way"])
+        if kept and mappable:
+            assert "with the position" in way
+        else:
+            assert "statusword event-driven" in way
+            assert ("polled" in way) == (kept and inhibit > 200)
+        if apply and not (kept and mappable):
+            assert cob_id & 0x8000_07FF == 0x181
+        changes = {each["object"]: each for each in found["differences"]}  # type: ignore[attr-defined]
+        if access == "writable" and inhibit:
+            assert (changes["1800:03"]["found"], changes["1800:03"]["wanted"]) == (f"{inhibit:08X}h", "00000000h")
+            assert held == (0 if apply else inhibit)
+        assert "1800:01" not in changes or (kept and mappable)
+
+
+IDENTIFIERS = st.frozensets(st.sampled_from([0x181, 0x182, 0x201, 0x301, 0x401, 0x402, 0x481]), max_size=2)
+
+
+@given(unused=st.lists(st.tuples(IDENTIFIERS, IDENTIFIERS), min_size=2, max_size=2))
+def test_an_identifier_that_is_sent_belongs_to_one_pdo(unused: list[tuple[frozenset[int], frozenset[int]]]) -> None:
+    with Line(SERVO) as line:
+        scales = scale_of("A", line.drives.A), scale_of("B", line.drives.B), scale_of("C", line.drives.C)
+        made = [each for each in survey(line.bus, line.drives, scales, 0.001, line.clock) if isinstance(each, SetUp)]
+    for number, (received, sent) in enumerate(unused):
+        exchange = dataclasses.replace(made[number].exchange, unused_rpdos=received, unused_tpdos=sent)
+        made[number] = made[number]._replace(exchange=exchange)
+    sent = [identifier for each in made for identifier in (*each.exchange.identifiers, *each.exchange.unused_tpdos)]
+    received = {identifier for each in made for identifier in each.exchange.unused_rpdos}
+    if len(sent) == len(set(sent)) and not received & set(sent):
+        check_identifiers(made)
+    else:
+        with pytest.raises(DriveError, match="which cannot be changed or switched off"):
+            check_identifiers(made)

@@ -132,7 +132,7 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
     setpoints, controlword = await pdos.setpoints(mode, velocity_offset=one.velocity_offset)
     feedback, status, polled, inputs = await pdos.feedback(inputs=bool(one.io.inputs))
     outputs = await pdos.outputs() if one.io.outputs else None
-    await pdos.switch_off_others()
+    unused_rpdos, unused_tpdos = await pdos.switch_off_others()
     for key in ((0x603F, 0), (0x1001, 0)):
         if not await remote.has(*key):
             differences.lack(key, "it has no such object")
@@ -153,6 +153,8 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
         outputs,
         kept,
         inputs,
+        unused_rpdos,
+        unused_tpdos,
     )
     vendor, product, revision, serial = [await remote.peek(0x1018, subindex) for subindex in range(1, 5)]
     device_type = await remote.peek(0x1000) or 0

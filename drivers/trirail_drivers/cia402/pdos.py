@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Differences
-from trirail_drivers.cia402.objects import title
+from trirail_drivers.cia402.objects import Key, title
 from trirail_drivers.cia402.process_data import (
     ACTUAL_POSITION,
     CONTROLWORD,
@@ -22,7 +23,7 @@ from trirail_drivers.cia402.process_data import (
     fits_feedback,
     fits_setpoints,
 )
-from trirail_drivers.cia402.sdo import INVALID, NO_REMOTE_REQUEST, SdoRefused
+from trirail_drivers.cia402.sdo import INVALID, NO_REMOTE_REQUEST, Remote, SdoRefused
 from trirail_drivers.errors import DriveError
 
 RPDO: Final = 0x1400
@@ -35,6 +36,8 @@ _IDENTIFIER: Final = 0x7FF
 EVERY_SYNC: Final = 1
 ON_CHANGE: Final = 255
 """Transmission types."""
+INHIBIT_UNIT_S: Final = 1e-4
+"""Unit of a PDO's inhibit time (CiA 301, 1800h:03) [s]."""
 _OFFSETS: Final = {0x60B0: "position", 0x60B1: "velocity", 0x60B2: "torque"}
 """Offsets that a drive adds to the setpoints of mode 8 (CiA 402-2)."""
 
@@ -77,6 +80,28 @@ class _TargetPdo(NamedTuple):
     """Subindex and value of the event timer, if it must change."""
     inhibit: tuple[int, int] | None
     """Subindex and value of the inhibit time, if it must change."""
+
+
+class _ReversibleWrites:
+    """Written values of one PDO, which can be undone if the drive refuses one of them."""
+
+    def __init__(self, remote: Remote) -> None:
+        self._remote = remote
+        self._before: list[tuple[Key, int]] = []
+
+    async def write(self, index: int, subindex: int, value: int) -> None:
+        """Write an object. Raises SdoRefused."""
+        before = await self._remote.peek(index, subindex)
+        await self._remote.write(index, subindex, value)
+        if before is not None:
+            self._before.append(((index, subindex), before))
+
+    async def undo(self) -> None:
+        """Write the previous values, the last one first: CiA 301 allows changes only in a certain order."""
+        while self._before:
+            key, before = self._before.pop()
+            with suppress(SdoRefused):
+                await self._remote.write(*key, before)
 
 
 class Pdos:
@@ -185,8 +210,12 @@ class Pdos:
 
         Return the same values as `feedback`, except that the last is whether the statusword's TPDO contains the inputs.
         """
-        timed = await self._remote.has(TPDO, 5) and await self._can_be_prompt(TPDO)
-        wanted = [(ACTUAL_POSITION,)] if timed else [(ACTUAL_POSITION, STATUSWORD), (ACTUAL_POSITION,)]
+        untimed = ""
+        if not await self._remote.has(TPDO, 5):
+            untimed = f"{title((0x1800, 5))}: it has none that can be used"
+        elif not await self._can_be_prompt(TPDO):
+            untimed = f"{title((0x1800, 3))}: it stays {await self._remote.peek(TPDO, 3)}"
+        wanted = [(ACTUAL_POSITION, STATUSWORD), (ACTUAL_POSITION,)] if untimed else [(ACTUAL_POSITION,)]
         for entries in wanted:
             identifier = await self._map(TPDO + 1, canopen_frames.TPDO2 + self._node, EVERY_SYNC, entries)
             if identifier is not None:
@@ -196,29 +225,40 @@ class Pdos:
             pdo = await self._find_fixed(TPDO, fits_feedback, "actual position 6064", EVERY_SYNC)
             chosen = FeedbackPdo(pdo.identifier, pdo.entries or ())
         if chosen.has_status:
-            if not timed:
-                self._drive.add_note(
-                    f"{title((0x1800, 5))}: it has none that can be used; its statusword comes with the position"
-                )
+            if untimed:
+                self._drive.add_note(f"{untimed}; its statusword comes with the position")
             return chosen, None, False, False
         status, polled, beside = await self._status(inputs=inputs)
         if polled:
             self._drive.add_note(f"its statusword is also requested by SDO, every {canopen_frames.POLL_PERIOD:g} s")
         return chosen, status, polled, beside
 
-    async def switch_off_others(self) -> None:
-        """Switch off unused PDOs, since they would add bus load or let other senders command the drive."""
-        for base in (RPDO, TPDO):
+    async def switch_off_others(self) -> tuple[frozenset[int], frozenset[int]]:
+        """Switch off unused PDOs, since they would add bus load or let other senders command the drive.
+
+        Return the identifiers of the RPDOs and of the TPDOs that stay on.
+        """
+        stay_on: dict[int, set[int]] = {RPDO: set(), TPDO: set()}
+        for base, identifiers in stay_on.items():
             for index in await self._all(base):
                 pdo = await self._pdo(index)
                 if index in self._used or not pdo.valid or pdo.cob_id is None:
                     continue
-                try:
-                    await self._remote.write(index, 1, pdo.cob_id | INVALID)
-                except SdoRefused:
-                    self._drive.add_note(f"PDO {index:04X} cannot be switched off, so it stays on, unused")
-                else:
+                if await self._can_be_switched_off(pdo):
                     self._drive.note((index, 1), pdo.cob_id, pdo.cob_id | INVALID, "a PDO that is not used")
+                else:
+                    self._drive.add_note(f"PDO {index:04X} cannot be switched off, so it stays on, unused")
+                    identifiers.add(pdo.identifier)
+        return frozenset(stay_on[RPDO]), frozenset(stay_on[TPDO])
+
+    async def _can_be_switched_off(self, pdo: PdoParameters) -> bool:
+        """Switch off a PDO; return whether it is off."""
+        try:
+            await self._remote.write(pdo.at, 1, (pdo.cob_id or 0) | INVALID)
+        except SdoRefused:
+            return False
+        held, _ = await self._remote.wait_until((pdo.at, 1), lambda held: bool(held & INVALID))
+        return held is None or bool(held & INVALID)
 
     # ------------------------------------------------------------------ mapping
 
@@ -264,12 +304,14 @@ class Pdos:
         return await remote.may_be_written(index, subindex)
 
     async def _try_to_map(self, current: PdoParameters, wanted: _TargetPdo) -> int | None:
+        """Map a PDO; return its identifier, or None if the drive refuses. Then the PDO is as it was before."""
         cob_id, kind, entries, timer, inhibit = wanted
-        index, write, wait_until = current.at, self._remote.write, self._remote.wait_until
+        index, wait_until = current.at, self._remote.wait_until
+        writes = _ReversibleWrites(self._remote)
         fixed = False
         try:
             # CiA 301: the identifier may change only while the PDO is invalid, so the old identifier is marked invalid.
-            await write(
+            await writes.write(
                 index, 1, (current.cob_id if current.valid and current.cob_id is not None else cob_id) | INVALID
             )
             await wait_until((index, 1), lambda held: bool(held & INVALID))
@@ -279,41 +321,45 @@ class Pdos:
             fixed, cob_id = True, current.cob_id or 0
         try:
             if current.kind != kind:
-                await write(index, 2, kind)
+                await writes.write(index, 2, kind)
                 await self._drive.confirm((index, 2), kind)
-            if inhibit is not None:
-                await write(index, *inhibit)
-                await self._drive.confirm((index, inhibit[0]), inhibit[1])
-            if timer is not None:
-                await self._set_timer(index, *timer)
+            for parameter in (inhibit, timer):
+                if parameter is not None:
+                    await self._set_time(writes, index, kind, *parameter)
             if not current.maps(entries):
-                await write(index + 0x200, 0, 0)
+                await writes.write(index + 0x200, 0, 0)
                 await wait_until((index + 0x200, 0), lambda held: held == 0)
                 for position, entry in enumerate(entries, start=1):
-                    await write(index + 0x200, position, entry)
+                    await writes.write(index + 0x200, position, entry)
                     await self._drive.confirm((index + 0x200, position), entry)
-                await write(index + 0x200, 0, len(entries))
+                await writes.write(index + 0x200, 0, len(entries))
                 await self._drive.confirm((index + 0x200, 0), len(entries))
+            if not fixed:
+                await writes.write(index, 1, cob_id)
         except SdoRefused as refusal:
             self._drive.add_note(f"PDO {index:04X} cannot be mapped as wanted: {str(refusal).partition(': ')[2]}")
-            if not fixed and current.valid and current.cob_id is not None:
-                await write(index, 1, current.cob_id)
+            await writes.undo()
             return None
         if not fixed:
-            await write(index, 1, cob_id)
             await self._drive.confirm((index, 1), cob_id)
         return cob_id & _IDENTIFIER
 
-    async def _set_timer(self, index: int, subindex: int, value: int) -> None:
-        """Set the event timer. If the drive refuses the timer of a TPDO, the statusword is also polled by SDO."""
+    async def _set_time(self, writes: _ReversibleWrites, index: int, kind: int, subindex: int, value: int) -> None:
+        """Set the event timer or the inhibit time of a PDO.
+
+        If the drive refuses one of a TPDO, the TPDO is used all the same: the statusword is also polled by SDO if it
+        may be late. A TPDO that is sent at SYNC ignores both times (CiA 301).
+        """
         try:
-            await self._remote.write(index, subindex, value)
+            await writes.write(index, subindex, value)
         except SdoRefused as refusal:
             if index < TPDO:
                 raise
             named = f"{index:04X}:{subindex:02X}"
             self._drive.changes = [each for each in self._drive.changes if each.object != named]
-            self._drive.lack((index, subindex), "it cannot be set", refusal)
+            if kind != EVERY_SYNC:
+                held = await self._remote.peek(index, subindex)
+                self._drive.lack((index, subindex), f"it cannot be set, and stays {held}", refusal)
             return
         await self._drive.confirm((index, subindex), value)
 
@@ -415,23 +461,26 @@ class Pdos:
         return pdo.identifier, not await self._is_repeated(pdo.at), False
 
     async def _is_repeated(self, index: int) -> bool:
-        """Whether the drive sends the statusword's TPDO periodically, often enough."""
-        period_ms = await self._remote.peek(index, 5)
-        return period_ms is not None and 0 < period_ms <= round(1000 * canopen_frames.STATUS_PERIOD)
+        """Whether the drive sends the statusword's TPDO periodically, often enough, and changes as early as a poll."""
+        period_ms, inhibit = await self._remote.peek(index, 5) or 0, await self._remote.peek(index, 3) or 0
+        is_prompt = inhibit <= round(canopen_frames.POLL_PERIOD / INHIBIT_UNIT_S)
+        return 0 < period_ms <= round(1000 * canopen_frames.STATUS_PERIOD) and is_prompt
 
     async def _can_be_prompt(self, index: int) -> bool:
         """Whether the inhibit time is 0 or can be set to 0. With another inhibit time, a statusword may be delayed."""
-        if not await self._remote.has(index, 3) or await self._remote.peek(index, 3) == 0:
+        held = await self._remote.peek(index, 3)
+        if not held:
             return True
-        cob_id = await self._remote.peek(index, 1) or 0
+        writes = _ReversibleWrites(self._remote)
         try:
-            await self._remote.write(index, 1, cob_id | INVALID)
+            await writes.write(index, 1, (await self._remote.peek(index, 1) or 0) | INVALID)
             await self._remote.wait_until((index, 1), lambda held: bool(held & INVALID))
-            await self._remote.write(index, 3, 0)
+            await writes.write(index, 3, 0)
+            can_be_0 = (await self._remote.wait_until((index, 3), lambda held: held == 0))[0] == 0
         except SdoRefused:
-            self._drive.lack((index, 3), "it cannot be set to 0")
-            return False
-        return (await self._remote.wait_until((index, 3), lambda held: held == 0))[0] == 0
+            can_be_0 = False
+        await writes.undo()
+        return can_be_0
 
     # ------------------------------------------------------------------ reading
 

@@ -150,6 +150,10 @@ class Exchange:
     """Identifier of the event-driven TPDO of the digital inputs, which may be the statusword's TPDO; None if there are
     no inputs.
     """
+    unused_rpdos: frozenset[int] = frozenset()
+    """Identifiers of the unused RPDOs that cannot be switched off."""
+    unused_tpdos: frozenset[int] = frozenset()
+    """Identifiers of the unused TPDOs that cannot be switched off."""
 
     @property
     def status_size(self) -> int:
@@ -158,7 +162,7 @@ class Exchange:
 
     @property
     def identifiers(self) -> set[int]:
-        """Identifiers of all PDOs of the drive."""
+        """Identifiers of the used PDOs and of the EMCY of the drive."""
         each = (
             self.setpoints.identifier,
             self.controlword,
@@ -166,8 +170,9 @@ class Exchange:
             self.feedback.identifier,
             self.status,
             self.inputs,
+            self.emergency,
         )
-        return {identifier for identifier in each if identifier is not None}
+        return {identifier for identifier in each if identifier}
 
     @property
     def name(self) -> str:

@@ -151,17 +151,27 @@ def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
 
 
 def check_identifiers(done: Sequence[SetUp]) -> None:
-    """Raise DriveError if two drives have PDOs with the same identifier, such as equal defaults that are fixed."""
+    """Raise DriveError if two PDOs have the same identifier, such as equal defaults that are fixed.
+
+    Only unused RPDOs that stay on may share an identifier, if nobody sends it.
+    """
     owners: dict[int, str] = {}
     for made in done:
-        for identifier in sorted(made.exchange.identifiers):
+        for identifier in (*sorted(made.exchange.identifiers), *sorted(made.exchange.unused_tpdos)):
             if identifier in owners:
-                raise DriveError(
-                    f"drives {owners[identifier]} and {made.name}: both have a PDO with identifier {identifier:03X}h "
-                    "that cannot be changed (1400:01, 1800:01 and on); give each drive its own identifier with the "
-                    "manufacturer's tool"
-                )
+                raise _shared_identifier(identifier, owners[identifier], made.name)
             owners[identifier] = made.name
+    for made in done:
+        for identifier in sorted(made.exchange.unused_rpdos & owners.keys()):
+            raise _shared_identifier(identifier, owners[identifier], made.name)
+
+
+def _shared_identifier(identifier: int, one: str, other: str) -> DriveError:
+    whose = f"drive {one}: more than one PDO has" if one == other else f"drives {one} and {other}: both have a PDO with"
+    return DriveError(
+        f"{whose} identifier {identifier:03X}h, which cannot be changed or switched off (1400:01, 1800:01 and on); "
+        "give each PDO its own identifier with the manufacturer's tool"
+    )
 
 
 def remotes(bus: can.BusABC, drives: Drives, clock: Clock) -> list[Remote]:
