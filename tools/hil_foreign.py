@@ -44,6 +44,7 @@ class LastingBus(can.BusABC):
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
+        self._can_protocol = bus.protocol
         self.channel_info = bus.channel_info
         super().__init__(channel=self.channel_info)
 

@@ -27,10 +27,12 @@ from trirail_drivers.bus.frame_calls import FrameCalls
 from trirail_drivers.bus.frame_io import PythonCanFrames, Received, SocketFrames, frame_io
 from trirail_drivers.bus.frames import Frame, fd_message, fd_packed, packed, unpacked
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames, packed_frames
+from trirail_drivers.bus.reopening import AbsentBus
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.config import Can, Drives
 from trirail_drivers.connection import opening, serving
 from trirail_drivers.driver.cyclic import Cyclic
+from trirail_drivers.driver.exclusive_bus import ExclusiveBus
 from trirail_drivers.errors import BusAbsentError, BusError, DriveError
 from trirail_drivers.timing import BusTiming
 
@@ -358,3 +360,14 @@ def test_a_bus_that_is_no_socket_is_one_of_can_fd_for_compiled_code(tmp_path: Pa
         room = PackedFrames(32)
         assert receive_frames(tables.bus, room.headers, room.frames, np.zeros(2, np.int64)) == (2, 0)
         assert [row.tobytes()[:9][-1] for row in room.frames[:2]] == [7, 8]
+
+
+@pytest.mark.parametrize("protocol", [can.CanProtocol.CAN_20, can.CanProtocol.CAN_FD])
+@pytest.mark.parametrize("wrap", [lambda bus: CapturedBus(bus, Capture()), lambda bus: ExclusiveBus(bus, lambda _: "")])
+def test_a_bus_around_another_has_its_protocol(
+    wrap: Callable[[can.BusABC], can.BusABC], protocol: can.CanProtocol
+) -> None:
+    with AbsentBus("can0") as inner:
+        inner._can_protocol = protocol
+        with wrap(inner) as outer:
+            assert outer.protocol is protocol

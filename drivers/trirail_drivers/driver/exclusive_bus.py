@@ -28,6 +28,7 @@ class ExclusiveBus(can.BusABC):
         self.inner = bus
         self._own = OwnFrames(bus)
         self._recognise = recognise
+        self._can_protocol = bus.protocol
         super().__init__(channel=bus.channel_info)
         self.channel_info = bus.channel_info
 
