@@ -66,19 +66,19 @@ def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pyte
     a, b = (tmp_path / f"drive-{name}.dcf" for name in "AB")
     assert run("drives", "compare", str(a)) == 0
     assert "0 of 79 parameters differ" in capsys.readouterr().out
-    head, section, rest = a.read_text().partition("[6066]")
+    head, section, rest = a.read_text().partition("[607C]")
     a.write_text(head + section + rest.replace("ParameterValue=0", "ParameterValue=77", 1))
     assert run("drives", "compare", str(a), "--json") == 1
     told = json.loads(capsys.readouterr().out)
     assert (told["ok"], told["other"]) == (False, "drive A")
-    assert told["differences"] == [{"object": "6066:00", "name": "Following error time out", "one": 77, "other": 0}]
+    assert told["differences"] == [{"object": "607C:00", "name": "Home offset", "one": 77, "other": 0}]
     assert run("drives", "compare", str(a), str(b)) == 1
     words = capsys.readouterr().out
     assert "serial: 00000001h and 00000002h" in words
-    assert "6066:00" in words
+    assert "607C:00" in words
     assert run("drives", "restore", str(a), "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["ok"], told["written"], told["left"], told["stored"]) == (True, ["6066:00"], [], False)
+    assert (told["ok"], told["written"], told["left"], told["stored"]) == (True, ["607C:00"], [], False)
     assert run("drives", "restore", str(b), "--drive", "A", "--replace", "--store") == 1, "these drives store nothing"
     assert "not stored: Object does not exist" in capsys.readouterr().out
     with pytest.raises(DriveError, match="drive A has serial 00000001h"):
@@ -88,7 +88,7 @@ def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pyte
         DriveError, match=r"drive-B\.dcf has node id 9, the drives have 1, 2, 3; select the drive with --drive"
     ):
         run("drives", "restore", str(b))
-    with pytest.raises(DriveError, match=r"drive B has node 00000002h \(the file's 00000009h\)"):
+    with pytest.raises(DriveError, match=r"drive B has node 2 \(the file's 9\)"):
         run("drives", "restore", str(b), "--drive", "B")
 
 

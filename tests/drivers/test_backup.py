@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import re
@@ -46,7 +47,7 @@ VOLATILE = {0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1F50, 0x1F51, 0x6040, 0x60
 """What these dictionaries let be written that no drive keeps: targets, offsets, controlwords, commands."""
 HOMING = {0x607C, 0x6098, 0x6099, 0x609A}
 """Objects that set-up writes only where a drive has homing, which these have not."""
-OWNED = {int(name[:4], 16) for name in USES} - HOMING | {0x60A9, 0x60AA}
+OWNED = {int(name[:4], 16) for name in USES} - HOMING | {0x60A9, 0x60AA, 0x60B0, 0x60B2}
 
 
 def set_ups(key: Key) -> bool:
@@ -351,10 +352,12 @@ def test_a_file_of_an_earlier_version_is_restored(tmp_path: Path) -> None:
     assert saved.origin == parameter_file.Origin(1, 0x2_0192, None, 0x3350_5250, 0x1_0000, 1)
     with Line(make_eds(tmp_path, "elmo_gold")) as line:
         done = line.restore(replace(saved, origin=line.save().origin))
-        held = {key: line.objects[key].value for key in ((0x6066, 0), (0x607D, 1), (0x607D, 2))}
+        held = {key: line.objects[key].value for key in ((0x607D, 1), (0x607D, 2))}
     assert set(done.written) == set(held)
-    assert list(held.values()) == [77, -5, 5]
-    assert {each.different.key for each in done.left} == {(0x1017, 0), (0x6065, 0)}, "they are the set-up's own"
+    assert list(held.values()) == [-5, 5]
+    assert {each.different.key for each in done.left} == {(0x1017, 0), (0x6065, 0), (0x6066, 0)}, (
+        "they are the set-up's own"
+    )
 
 
 @pytest.mark.parametrize(
@@ -596,7 +599,7 @@ def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
         ({"device_type": 401}, "device_type is .*; use a file for the same product", False),
         ({"serial": 9}, r"drive A has serial 00000004h \(the file's 00000009h\).*--replace", True),
         ({"revision": 9}, r"drive A has revision 00000003h \(the file's 00000009h\).*--replace", True),
-        ({"node": 2}, r"drive A has node 00000001h \(the file's 00000002h\).*--replace", True),
+        ({"node": 2}, r"drive A has node 1 \(the file's 2\).*--replace", True),
     ],
 )
 def test_a_file_of_another_drive(changes: dict[str, int], refused: str, replaceable: bool, tmp_path: Path) -> None:
@@ -912,3 +915,141 @@ def test_what_a_drive_does_not_tell_is_said_with_the_reason(rig: Foreign) -> Non
     assert saved.unread == {SPEED: "Attempt to read a write only object (SDO abort 06010001)"}
     assert named(SPEED) not in {named(key) for key in saved.parameters}
     assert rig.a.state == DISABLED
+
+
+def listed(count: int, kind: int = 0x07, name: str = "Value") -> str:
+    """Sections of an EDS with a manufacturer's objects."""
+    return "".join(
+        f"\n[{0x2100 + number:04X}]\nParameterName={name} {number}\nObjectType=0x7\nDataType={kind}\n"
+        f"AccessType=rw\nDefaultValue={number}\nPDOMapping=0\n"
+        for number in range(count)
+    )
+
+
+class AlteredBus(can.BusABC):
+    """Bus on which the answers of drive A are altered or lost."""
+
+    def __init__(self, inner: can.BusABC, alter: Callable[[can.Message], can.Message | None]) -> None:
+        self._inner = inner
+        self._alter = alter
+        super().__init__(channel="altered")
+        self.channel_info = "altered"
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self._inner.send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        frame = self._inner.recv(timeout)
+        return self._alter(frame) if frame is not None and frame.arbitration_id == 0x581 else frame
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self._inner.shutdown()
+
+
+def losing(lost: set[int]) -> Callable[[can.Message], can.Message | None]:
+    """Lose the answers of these numbers."""
+    numbers = itertools.count()
+    return lambda frame: None if next(numbers) in lost else frame
+
+
+@settings(max_examples=40)
+@given(lost=st.sets(st.integers(0, 250), max_size=8))
+def test_single_lost_frames_end_neither_a_save_nor_a_restore(
+    tmp_path_factory: pytest.TempPathFactory, lost: set[int]
+) -> None:
+    lost = {number for number in lost if not {number + 1, number + 2} & lost}
+    path = tmp_path_factory.mktemp("eds") / "a.eds"
+    path.write_text(SERVO.read_text() + listed(20))
+    with Line(path) as line:
+        saved = line.save()
+    with Line(path) as line:
+        line.bus = AlteredBus(line.bus, losing(lost))
+        again = line.save()
+        assert (again.parameters, again.unread) == (saved.parameters, {})
+        for number in range(20):
+            line.objects[0x2100 + number, 0].value = 1000
+        line.bus = AlteredBus(line.bus, losing(lost))
+        assert line.restore(saved).ok
+        assert [line.objects[0x2100 + number, 0].value for number in range(20)] == list(range(20))
+
+
+@pytest.mark.parametrize("interrupts", [False, True])
+@pytest.mark.parametrize("answers", [140, 170, 200])
+def test_a_restore_that_ends_early_tells_what_it_has_written(tmp_path: Path, answers: int, interrupts: bool) -> None:
+    path = tmp_path / "a.eds"
+    path.write_text(SERVO.read_text() + listed(20))
+    with Line(path) as line:
+        saved = line.save()
+        for number in range(20):
+            line.objects[0x2100 + number, 0].value = 1000
+        left = itertools.count()
+
+        def end(frame: can.Message) -> can.Message | None:
+            if next(left) < answers:
+                return frame
+            if interrupts:
+                raise KeyboardInterrupt
+            return None
+
+        line.bus = AlteredBus(line.bus, end)
+        with pytest.raises(
+            backup.RestoreAborted, match=r"\d+ of 20 parameters were written: restore it again"
+        ) as ended:
+            line.restore(saved)
+    held = [line.objects[0x2100 + number, 0].value == number for number in range(20)]
+    assert 0 <= sum(held) - len(ended.value.written) <= 1
+    assert ended.value.intended == 20
+    assert "interrupted" in str(ended.value) or not interrupts
+
+
+def test_a_restart_while_parameters_are_read_is_no_restart_of_a_set_up(rig: Foreign) -> None:
+    booted = can.Message(arbitration_id=0x701, data=b"\0", is_extended_id=False)
+    answers = itertools.count()
+    rig.bus = AlteredBus(rig.wires, lambda frame: booted if next(answers) == 9 else frame)
+    end = backup.save(rig.bus, rig.drives, rig.clock, ["A"])["A"]
+    assert str(end) == "drive A: the drive restarted meanwhile; check its power supply"
+
+
+SEGMENT, TOGGLE, LAST = 0, 0x10, 1
+
+
+def altered(change: str, frame: can.Message) -> can.Message:
+    """An answer with a segment that contradicts the transfer."""
+    first = frame.data[0]
+    if first >> 5 == SEGMENT and first & TOGGLE:
+        frame.data[0] = first & ~TOGGLE if change == "toggle" else first | LAST
+    return frame
+
+
+@pytest.mark.parametrize(("change", "said"), [("toggle", "Toggle bit"), ("cut off", "14 bytes received, 26 announced")])
+def test_a_wrong_transfer_costs_one_object(tmp_path: Path, change: str, said: str) -> None:
+    path = tmp_path / "a.eds"
+    path.write_text(SERVO.read_text() + listed(1, TEXT))
+    with Line(path) as line:
+        line.objects[0x2100, 0].content = b"abcdefghijklmnopqrstuvwxyz"
+        line.bus = AlteredBus(line.bus, partial(altered, change))
+        saved = line.save()
+    assert {key: said in why for key, why in saved.unread.items()} == {(0x2100, 0): True}
+    assert not saved.unanswered
+    assert (0x6065, 0) in saved.parameters
+
+
+def test_an_object_without_an_answer_is_known_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "a.eds"
+    path.write_text(SERVO.read_text() + listed(2))
+    with Line(path) as line:
+        line.bus = AlteredBus(line.bus, lambda frame: None if frame.data[1:3] == b"\1\x21" else frame)
+        saved = line.save()
+    assert saved.unanswered == set(saved.unread) == {(0x2101, 0)}
+
+
+@pytest.mark.parametrize("text", ["0x-1", "0x-", "0x-x", "0X-1"])
+def test_a_text_like_a_negative_number_is_kept(tmp_path: Path, text: str) -> None:
+    eds_path, path = tmp_path / "a.eds", tmp_path / "a.dcf"
+    eds_path.write_text(SERVO.read_text() + listed(1, TEXT))
+    with Line(eds_path) as line:
+        line.objects[0x2100, 0].content = text.encode()
+        saved = line.save()
+    parameter_file.write(path, saved)
+    assert parameter_file.read(path).parameters[0x2100, 0].value == text

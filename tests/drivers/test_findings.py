@@ -335,9 +335,9 @@ def test_an_identifier_that_is_sent_belongs_to_one_pdo(unused: list[tuple[frozen
     for number, (received, sent) in enumerate(unused):
         exchange = dataclasses.replace(made[number].exchange, unused_rpdos=received, unused_tpdos=sent)
         made[number] = made[number]._replace(exchange=exchange)
-    sent = [identifier for each in made for identifier in (*each.exchange.identifiers, *each.exchange.unused_tpdos)]
-    received = {identifier for each in made for identifier in each.exchange.unused_rpdos}
-    if len(sent) == len(set(sent)) and not received & set(sent):
+    taken = [identifier for each in made for identifier in (*each.exchange.identifiers, *each.exchange.unused_tpdos)]
+    idle = {identifier for each in made for identifier in each.exchange.unused_rpdos}
+    if len(taken) == len(set(taken)) and not idle & set(taken):
         check_identifiers(made)
     else:
         with pytest.raises(DriveError, match="which cannot be changed or switched off"):

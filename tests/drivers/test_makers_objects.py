@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
 import pytest
 from drivers.foreign import Habits
-from drivers.test_foreign import PERIOD, Rig
+from drivers.test_foreign import MAKES, PERIOD, Rig
+from edsfiles import rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigs import Closing
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
 from trirail_drivers.cia402 import inspection
-from trirail_drivers.cia402.makers_objects import owned
+from trirail_drivers.cia402.makers_objects import address, owned
 from trirail_drivers.cia402.objects import USES
-from trirail_drivers.config import Drive, Homing, ObjectWrite
+from trirail_drivers.config import DigitalIo, Drive, Homing, ObjectWrite
 from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 KINDS = {"i8": 0x02, "i16": 0x03, "i32": 0x04, "u8": 0x05, "u16": 0x06, "u32": 0x07}
 """CiA 301 data types."""
 BRAKE = ObjectWrite(object=0x208E, value=0x100, type="u16", why="the brake opens late")
+COMMANDED = {(0x6040, 0)}
+"""Command of the set-up, which is no parameter."""
 ROWS = ((0x208E, 0, 6, "rw", 0, False), (0x2090, 1, 4, "rw", 7, False))
 
 
@@ -125,7 +129,9 @@ def configured(folder: Path, lines: str, example: str = "elmo_gold") -> Path:
 
 WHY = 'why = "…"'
 HOMING = {"607C", "6098", "6099", "609A"}
-OWNED = sorted({name[:4] for name in USES} - HOMING | {"1010", "1011", "100B", "1600", "1A03", "60A9", "60AA"})
+OWNED = sorted(
+    {name[:4] for name in USES} - HOMING | {"1010", "1011", "100B", "1600", "1A03", "60A9", "60AA", "60B0", "60B2"}
+)
 
 
 @pytest.mark.parametrize("index", OWNED)
@@ -166,3 +172,50 @@ def test_objects_of_homing_are_the_set_ups_only_with_homing(index: str, homes: b
     homing = Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5) if homes else None
     reason = owned((int(index, 16), 0), Drive(node=1, counts_per_metre=1e6, homing=homing))
     assert reason.startswith("is written by the set-up") == homes
+
+
+@settings(max_examples=20)
+@given(make=st.sampled_from(sorted(MAKES)), data=st.data(), homes=st.booleans(), outputs=st.integers(0, 3))
+def test_what_the_set_up_writes_is_refused_and_not_restored(
+    make: str, data: st.DataObject, homes: bool, outputs: int
+) -> None:
+    """Whatever a drive holds at first."""
+    held = data.draw(
+        st.fixed_dictionaries(
+            {},
+            optional={
+                (row[0], row[1]): st.integers(0, 200)
+                for row in rows(make)
+                if row[3].startswith("rw") and row[2] in (2, 3, 4, 5, 6, 7) and row[0] not in (0x6040, 0x6060)
+            },
+        )
+    )
+    more = ((0x60B0, 0, 4, "rw", 3, False), (0x60B2, 0, 3, "rw", 4, False), (0x6066, 0, 6, "rw", 150, False))
+    there = {row[0] for row in rows(make)}
+    homing = Homing(method=37, speed_switch=0.02, speed_zero=0.005, acceleration=0.5) if homes else None
+    habits = Habits(values=held, more=tuple(row for row in more if row[0] not in there))
+    rig = Rig(make, habits, homing=homing, io=3 * (DigitalIo(outputs << 16, 0, 0),))
+    try:
+        with contextlib.suppress(DriveError):
+            rig.drives.configure(PERIOD)
+        drive = rig.config.A
+        written = {(index, subindex) for node in rig.nodes for index, subindex, *_ in node.written} - COMMANDED
+        assert {key for key in written if not owned(key, drive)} == set()
+    finally:
+        rig.drives.close()
+
+
+@pytest.mark.parametrize(
+    "name",
+    "CANaddress;CAN node number;Node address;CAN address;Station address;Device ID;CAN_ID;Bit timing;Node-ID;"
+    "CANopen NodeID;Baudrate;CAN bit rate;Node Number;Bus address".split(";"),
+)
+def test_an_object_with_the_name_of_an_address_is_left(name: str) -> None:
+    assert "node id or bitrate" in address((0x3041, 0), name, 1)
+
+
+@pytest.mark.parametrize(
+    "name", ["Device identification", "Encoder ID", "Motor number", "Scan address", "Bus voltage", "Cancel number"]
+)
+def test_an_object_with_another_name_is_none(name: str) -> None:
+    assert address((0x3041, 0), name, 1) == ""

@@ -125,7 +125,7 @@ def test_a_drive_that_boots_again_and_again_is_told(closing: Closing) -> None:
 def test_a_drive_that_restarts_while_it_is_set_up_is_told(closing: Closing) -> None:
     rig = closing(SlowRig("elmo_gold", lambda _: Slowness(answer=lambda: 0.01)))
     rig.wires.slow[2].boots_in(0.5)
-    with pytest.raises(DriveError, match=r"^drive C: the drive restarted during its set-up"):
+    with pytest.raises(DriveError, match=r"^drive C: the drive restarted meanwhile"):
         rig.drives.configure(PERIOD)
     rig.drives.close()
 
@@ -153,7 +153,7 @@ def test_a_drive_that_restarts_at_any_time_is_told_or_has_all_its_settings(closi
     except DriveError as error:
         refused = str(error)
     if refused:
-        assert refused == "drive A: the drive restarted during its set-up; check its power supply"
+        assert refused == "drive A: the drive restarted meanwhile; check its power supply"
         return
     fault = [rig.cycle().fault for _ in range(3)][-1]
     assert _settings(rig) == _settings(whole) or (fault is not None and "has restarted" in str(fault)), fault

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from typing import Any, Final, NamedTuple, TypeVar
 
 import can
@@ -24,14 +26,16 @@ from trirail_drivers.cia402.parameter_file import (
     origin,
 )
 from trirail_drivers.cia402.parameters import Parameter, is_parameter, named, parameter, variables
-from trirail_drivers.cia402.sdo import Remote, SdoRefused, reason
+from trirail_drivers.cia402.sdo import Remote, SdoRefused, TransferError, reason
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.conversations import read_until, run_concurrently
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock, PowerState
 
+MAX_ATTEMPTS: Final = 3
+"""Maximum number of requests for one object, of which frames may be lost."""
 MAX_TIMEOUTS: Final = 3
-"""Number of consecutive unanswered requests after which a drive counts as lost."""
+"""Number of consecutive objects without an answer after which a drive counts as lost."""
 MAX_WRITE_ROUNDS: Final = 3
 """Maximum number of passes over the differing values. Several are needed because one value may change another."""
 STORE_TIMEOUT_S: Final = 20.0
@@ -71,6 +75,20 @@ class RestoreResult(NamedTuple):
         return all(each.intended for each in self.left) and not self.not_stored
 
 
+class RestoreAborted(DriveError):
+    """A restore ended after some parameters had been written: the drive has parameters of both kinds."""
+
+    def __init__(self, drive: str, written: tuple[Key, ...], intended: int, cause: BaseException) -> None:
+        super().__init__(
+            f"{str(cause) or 'interrupted'}; drive {drive}: {len(written)} of {intended} parameters were written: "
+            "restore it again before use"
+        )
+        self.written = written
+        """Parameters that were written and read back."""
+        self.intended = intended
+        """Number of parameters that differed from the file."""
+
+
 def save(
     bus: can.BusABC, drives: Drives, clock: Clock, names: Sequence[str] = NAMES
 ) -> dict[str, SavedParameters | DriveError]:
@@ -100,16 +118,21 @@ def restore(
     bus.
     """
     begun = _Progress()
-    (result,) = _run_conversations(
-        bus,
-        drives,
-        clock,
-        [name],
-        begun,
-        lambda remote, drive: _restore(remote, drive, saved, begun, replace=replace, store=store),
-    ).values()
-    if isinstance(result, DriveError):
-        raise result
+    try:
+        (result,) = _run_conversations(
+            bus,
+            drives,
+            clock,
+            [name],
+            begun,
+            lambda remote, drive: _restore(remote, drive, saved, begun, replace=replace, store=store),
+        ).values()
+        if isinstance(result, DriveError):
+            raise result
+    except (DriveError, KeyboardInterrupt) as error:
+        if not begun.has_begun:
+            raise
+        raise RestoreAborted(name, tuple(begun.written), begun.intended, error) from error
     return result
 
 
@@ -117,6 +140,12 @@ class _Progress:
     """Progress of each drive: number of finished objects, and their total number."""
 
     def __init__(self) -> None:
+        self.has_begun = False
+        """Whether a restore has begun to write."""
+        self.written: dict[Key, None] = {}
+        """Parameters that a restore has written and read back."""
+        self.intended = 0
+        """Number of parameters that a restore must write."""
         self.doing = "reading parameters"
         self.of: dict[str, tuple[int, int]] = {}
 
@@ -148,37 +177,51 @@ async def _save(remote: Remote, drive: Drive, progress: _Progress) -> SavedParam
     asked = [(key, variable) for key, variable in variables(remote.client.od) if is_parameter(variable)]
     read: dict[Key, Parameter] = {}
     unread: dict[Key, str] = {}
+    unanswered: set[Key] = set()
     silent = 0
     for number, (key, variable) in enumerate(asked):
         progress.of[remote.name] = number, len(asked)
         try:
-            content = await remote.content(key)
+            content = await _repeat(partial(remote.content, key))
         except SdoRefused as refusal:
             unread[key] = reason(refusal.code)
+        except TransferError as error:
+            unread[key] = str(error).partition(": ")[2]
         except DriveTimeout:
             silent += 1
             if silent == MAX_TIMEOUTS:
                 raise
             unread[key] = f"no answer within {remote.client.timeout:g} s"
+            unanswered.add(key)
         else:
             silent = 0
             if content:
                 read[key] = parameter(variable.data_type, content, variable.qualname)
             else:
                 unread[key] = "it is empty, which no file can hold"
-    return SavedParameters(drive_origin, read, unread, remote.client.od)
+    return SavedParameters(drive_origin, read, unread, remote.client.od, unanswered=frozenset(unanswered))
+
+
+async def _repeat(request: Callable[[], Coroutine[Any, Any, T]]) -> T:
+    """Repeat a request whose answer was lost, and return its result. Raises the error of the last attempt."""
+    for _ in range(MAX_ATTEMPTS - 1):
+        with suppress(DriveTimeout, TransferError):
+            return await request()
+    return await request()
 
 
 async def _extend_arrays(remote: Remote) -> None:
     """Add the array elements that the EDS omits to the dictionary; subindex 0 contains their number (CiA 301)."""
     for index, item in remote.client.od.items():
         if isinstance(item, ODArray) and 1 in item.subindices and is_parameter(item.subindices[1]):
-            for subindex in range(1, (await remote.peek(index) or 0) + 1):
+            for subindex in range(1, (await _repeat(partial(remote.peek, index)) or 0) + 1):
                 item.add_member(item[subindex])
 
 
 async def _origin(remote: Remote, drive: Drive) -> Origin:
-    return origin({name: await remote.peek(*key) for name, key in IDENTITY.items()} | {"node": drive.node})
+    return origin(
+        {name: await _repeat(partial(remote.peek, *key)) for name, key in IDENTITY.items()} | {"node": drive.node}
+    )
 
 
 async def _restore(
@@ -194,11 +237,9 @@ async def _restore(
         for key, each in saved.parameters.items()
     }
     intended = {key: each for key, each in saved.parameters.items() if not kept[key]}
-    written: dict[Key, None] = {}
     refused: dict[Key, str] = {}
     for _ in range(MAX_WRITE_ROUNDS):
         done, refused = await _write(remote, intended, progress)
-        written |= dict.fromkeys(done)
         if not done:
             break
     now = await _read_held(remote, saved.parameters, progress)
@@ -210,7 +251,7 @@ async def _restore(
     if store:
         not_stored = await _store(remote) if all(each.intended for each in left) else "not all is as in the file"
         stored = not not_stored
-    return RestoreResult(tuple(written), left, stored, not_stored)
+    return RestoreResult(tuple(progress.written), left, stored, not_stored)
 
 
 async def _write(
@@ -227,18 +268,21 @@ async def _write(
         if intended[key].fixed_size and size != len(intended[key].data):
             raise DriveError(
                 f"drive {remote.name}: object {named(key)} has {size} bytes, but "
-                f"{len(intended[key].data)} in the file; nothing was written"
+                f"{len(intended[key].data)} in the file{'' if progress.has_begun else '; nothing was written'}"
             )
     written: list[Key] = []
     refused: dict[Key, str] = {}
+    progress.intended = len({*due, *progress.written})
     progress.doing = "writing parameters"
     while due:
         for number, key in enumerate(due):
             progress.of[remote.name] = number, len(due)
             await _check_without_power(remote)
+            progress.has_begun = True
             refused[key] = await _write_one(remote, key, intended[key], held.get(key))
             if not refused[key]:
                 written.append(key)
+                progress.written[key] = None
         again = [key for key in due if refused[key]]
         if len(again) == len(due):
             break
@@ -251,10 +295,14 @@ async def _write_one(remote: Remote, key: Key, wanted: Parameter, held: Paramete
     if held is None:
         return "the drive does not let it be read"
     try:
-        await remote.put(key, wanted.data, str(wanted.value))
+        await _repeat(partial(remote.put, key, wanted.data, str(wanted.value)))
         client = remote.client
         result, waited = await read_until(
-            lambda: remote.content(key), lambda data: data == wanted.data, client.pause, client.clock, client.timeout
+            lambda: _repeat(partial(remote.content, key)),
+            lambda data: data == wanted.data,
+            client.pause,
+            client.clock,
+            client.timeout,
         )
     except SdoRefused as refusal:
         return reason(refusal.code)
@@ -268,8 +316,8 @@ async def _read_held(remote: Remote, parameters: Mapping[Key, Parameter], progre
     for number, (key, each) in enumerate(parameters.items()):
         progress.of[remote.name] = number, len(parameters)
         try:
-            held[key] = parameter(each.data_type, await remote.content(key), each.name)
-        except SdoRefused:
+            held[key] = parameter(each.data_type, await _repeat(partial(remote.content, key)), each.name)
+        except (SdoRefused, TransferError):
             continue
     return held
 
@@ -294,10 +342,11 @@ def _check(name: str, of_file: Origin, of_drive: Origin, *, replace: bool) -> No
             continue
         if theirs is not None and field in ("device_type", "vendor", "product"):
             raise DriveError(
-                f"drive {name}: its {field} is {format_number(mine)}, but the file has {format_number(theirs)}; "
+                f"drive {name}: its {field} is {format_number(field, mine)}, but the file has "
+                f"{format_number(field, theirs)}; "
                 "use a file for the same product"
             )
-        others.append(f"{field} {format_number(mine)} (the file's {format_number(theirs)})")
+        others.append(f"{field} {format_number(field, mine)} (the file's {format_number(field, theirs)})")
     if others and not replace:
         raise DriveError(
             f"drive {name} has {', '.join(others)}; if that is intended, as with a spare drive, add --replace"
@@ -305,7 +354,7 @@ def _check(name: str, of_file: Origin, of_drive: Origin, *, replace: bool) -> No
 
 
 async def _check_without_power(remote: Remote) -> None:
-    statusword = await remote.read(0x6041)
+    statusword = await _repeat(partial(remote.read, 0x6041))
     state = canopen_frames.power_state(statusword)
     if state in _POWERED:
         raise DriveError(

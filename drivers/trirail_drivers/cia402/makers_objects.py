@@ -17,14 +17,19 @@ _ADDRESS: Final = "changes node id or bitrate, for which the manufacturer's tool
 _FORBIDDEN: Final = {0x1010: _STORES, 0x1011: _STORES, 0x100B: _ADDRESS}
 _HOMING: Final = (0x607C, 0x6098, 0x6099, 0x609A)
 """Objects that the set-up writes only for a drive with homing."""
-_UNITS: Final = (0x60A9, 0x60AA)
-"""Objects that are not in USES but that the set-up may write."""
+_UNITS_AND_OFFSETS: Final = (0x60A9, 0x60AA, 0x60B0, 0x60B2)
+"""Objects that are not in USES but that the set-up may write: units, and offsets of the setpoints."""
 _ADDRESSES: Final = {
     0x0000_00FB: (0x2000, 0x2001),  # maxon, EPOS4 Firmware Specification: Node-ID, CAN bit rate
     0x0000_026C: (0x2005, 0x2009),  # Nanotec, manuals, object dictionary: CANopen Baudrate, CANopen NodeID
 }
 """Objects that contain the node id and the bit rate, by vendor id (1018h:01)."""
-_ADDRESS_NAMES: Final = re.compile(r"node.?id|bit.?rate|baud", re.IGNORECASE)
+_ADDRESS_NAMES: Final = re.compile(
+    r"(node|station|device|slave|bus|(?<![a-z])can(open)?).?(id\b|id[^a-z]|addr|n(umbe)?r\b)|node.?id|"
+    r"can(open)?.?node|bit.?(rate|timing)|baud",
+    re.IGNORECASE,
+)
+"""Usual names of objects that contain the node id or the bit rate."""
 
 
 def check(name: str, drive: Drive, number: int) -> None:
@@ -45,7 +50,7 @@ def owned(key: Key, drive: Drive) -> str:
     if key[0] in _HOMING and drive.homing is None:
         return ""
     used = find_use(key)
-    if used is not None or is_pdo(key[0]) or key[0] in _UNITS:
+    if used is not None or is_pdo(key[0]) or key[0] in _UNITS_AND_OFFSETS:
         return f"is written by the set-up{f', for {used[1].purpose}' if used else ''}"
     return _FORBIDDEN.get(key[0], "")
 

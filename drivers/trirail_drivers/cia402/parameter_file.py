@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import canopen
 import msgspec
 from canopen.objectdictionary import INTEGER_TYPES, SIGNED_TYPES, ObjectDictionary, ODVariable
-from canopen.objectdictionary.datatypes import OCTET_STRING, REAL32, REAL64, VISIBLE_STRING
+from canopen.objectdictionary.datatypes import OCTET_STRING, REAL32, REAL64, UNICODE_STRING, VISIBLE_STRING
 from canopen.objectdictionary.eds import export_dcf
 from msgspec import Meta, Struct
 
@@ -37,6 +37,11 @@ IDENTITY: Final[Mapping[str, Key]] = {
 _UNUSED: Final = re.compile("FileInfo|Comments|DummyUsage|DeviceComm?issioning", re.IGNORECASE)
 """Names of sections that describe no object; canopen refuses some of these sections in files from other programs."""
 _KEYWORDS: Final = {each.lower(): each for each in ("ParameterValue", "NodeID", "LSS_SerialNumber")}
+_NEGATIVE: Final = re.compile(r"0x-[0-9a-f]+", re.IGNORECASE)
+_TEXTS: Final = frozenset(
+    text for kind in (VISIBLE_STRING, UNICODE_STRING) for text in (f"{kind}", f"0x{kind:x}", f"0x{kind:04x}")
+)
+"""Data types of texts, as they are written in files."""
 _LISTS: Final = {each.upper(): each for each in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")}
 """Sections that list the objects of a file, by their names in capital letters."""
 _COMPACT: Final = re.compile("([0-9a-f]{4})value", re.IGNORECASE)
@@ -73,6 +78,8 @@ class SavedParameters:
     """All objects of the drive, for other programs that open the file."""
     complete: bool = field(default=True, compare=False)
     """Whether the drive certainly lacks every object that is not listed; False for a DCF, which may list only some."""
+    unanswered: frozenset[Key] = field(default=frozenset(), compare=False)
+    """Parameters without a value because the drive did not answer."""
 
     def knows(self, key: Key) -> bool:
         """Whether the value of an object is known, or the drive is known to lack the object."""
@@ -105,9 +112,9 @@ def compare(one: SavedParameters, other: SavedParameters) -> list[ParameterDiffe
     return differences
 
 
-def format_number(value: int | None) -> str:
-    """Return an identity number as text for people."""
-    return "unknown" if value is None else f"{value:08X}h"
+def format_number(field: str, value: int | None) -> str:
+    """Return an identity number as text for people, given the name of its field in Origin."""
+    return "unknown" if value is None else str(value) if field == "node" else f"{value:08X}h"
 
 
 def origin(numbers: Mapping[str, Any]) -> Origin:
@@ -219,7 +226,8 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
         for option, content in sections.items(name):
             if not content and option != "ParameterName":
                 sections.remove_option(name, option)
-            elif content.startswith("0x-"):  # canopen writes negative numbers this way, and cannot read them
+            elif _NEGATIVE.fullmatch(content) and not _is_text(sections, name):
+                # canopen writes negative numbers this way, and cannot read them.
                 sections[name][option] = f"-0x{content[3:]}"
         if _UNUSED.fullmatch(name):
             commissioned |= {key: int(sections[name][key], 0) for key in _KEYWORDS.values() if key in sections[name]}
@@ -227,6 +235,12 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
         elif compact := _COMPACT.fullmatch(name):
             _expand(sections, compact[1], sections[name])
     return sections, {"node": commissioned.get("NodeID"), "serial": commissioned.get("LSS_SerialNumber")}
+
+
+def _is_text(sections: configparser.RawConfigParser, name: str) -> bool:
+    """Whether a section contains texts, judging by its data type or, for array values, by that of the array."""
+    described = next((each for each in (name, name[:4]) if sections.has_option(each, "DataType")), None)
+    return described is not None and sections[described]["DataType"].strip().lower() in _TEXTS
 
 
 def _check_lists(sections: configparser.RawConfigParser, described: set[int]) -> None:

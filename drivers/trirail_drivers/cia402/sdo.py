@@ -46,6 +46,10 @@ class RestartedError(DriveError):
     """A drive has restarted and lost its set-up."""
 
 
+class TransferError(DriveError):
+    """An SDO transfer contradicts the protocol, as after a lost frame."""
+
+
 class Remote:
     """Object dictionary of a drive over SDO. Errors name the drive and the object.
 
@@ -223,7 +227,7 @@ class Remote:
 
     def restarted(self) -> RestartedError:
         """Return the error of a drive that has restarted."""
-        return RestartedError(f"drive {self.name}: the drive restarted during its set-up; check its power supply")
+        return RestartedError(f"drive {self.name}: the drive restarted meanwhile; check its power supply")
 
     @contextmanager
     def _as_drive_error(self, attempt: str, key: Key) -> Iterator[None]:
@@ -242,7 +246,7 @@ class Remote:
         except BootedError as error:
             raise self.restarted() from error
         except SdoCommunicationError as error:
-            raise DriveError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
+            raise TransferError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
         except (can.CanError, OSError) as error:
             raise BusError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
 

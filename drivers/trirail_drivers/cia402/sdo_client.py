@@ -91,6 +91,7 @@ class Client:
         if answer[0] & _IS_EXPEDITED:
             unused = answer[0] >> 2 & 3 if answer[0] & _HAS_SIZE else 0
             return answer[4 : 8 - unused]
+        size = int.from_bytes(answer[4:], "little") if answer[0] & _HAS_SIZE else None
         content, toggle = b"", 0
         while True:
             answer = await self._request(bytes([_UPLOAD_SEGMENT << 5 | toggle, *bytes(7)]), (index, subindex))
@@ -99,8 +100,11 @@ class Client:
                 raise SdoCommunicationError("Toggle bit mismatch")
             content += answer[1 : 8 - (answer[0] >> 1 & 7)]
             if answer[0] & _LAST:
-                return content
+                break
             toggle ^= _TOGGLE
+        if size not in (None, len(content)):
+            raise SdoCommunicationError(f"{len(content)} bytes received, {size} announced")
+        return content
 
     async def download(self, index: int, subindex: int, data: bytes) -> None:
         """Write an object. Raises the same errors as `upload`."""

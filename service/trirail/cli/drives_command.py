@@ -187,7 +187,7 @@ def compare(
     for field in ("vendor", "product", "revision", "serial"):
         mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
         if mine != theirs:
-            here, there = map(parameter_file.format_number, (mine, theirs))
+            here, there = (parameter_file.format_number(field, number) for number in (mine, theirs))
             terminal.print_line(f"{field}: {here} and {there}")
     if differences:
         _print_differences(str(file), heading, [(each, "") for each in differences])

@@ -103,11 +103,11 @@ def judge_homing(
             f"check {slider}'s home switch, its wiring, and drives.{drive}.homing: method, speeds, timeout",
         )
     moved = "" if travel is None else f"moved {format_mm(travel)} and "
-    words = (f"drive {drive} reports home; {slider} {moved}is at {format_mm(position)}",)
+    words: tuple[str, ...] = (f"drive {drive} reports home; {slider} {moved}is at {format_mm(position)}",)
     if abs(position - offset) > MAX_HOME_DEVIATION:
         words = (
             *words,
-            f"but drives.{drive}.offset = {format_mm(offset)}: right only if the slider stopped so far beyond home",
+            f"but drives.{drive}.offset is {format_mm(offset)}: check home, unless the slider stopped beyond its switch",
         )
     if confirmed:
         return Judgement("ok", words)
