@@ -9,6 +9,7 @@ from canopen import SdoAbortedError
 from drivers.foreign import Habits
 from drivers.test_backup import Line
 from drivers.test_foreign import PERIOD, Rig
+from edsfiles import rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -242,7 +243,7 @@ def test_a_pdo_that_stays_on_shares_no_identifier_with_a_used_one(ignores: bool,
     if ignores and not apply:
         return  # only a write shows it
     if identifier in used:
-        assert f"identifier {identifier:03X}h, which cannot be changed" in refused
+        assert f"identifier {identifier:03X}h that cannot be changed" in refused
     else:
         assert not refused
         assert "PDO 1402 cannot be switched off" in notes
@@ -340,5 +341,76 @@ def test_an_identifier_that_is_sent_belongs_to_one_pdo(unused: list[tuple[frozen
     if len(taken) == len(set(taken)) and not idle & set(taken):
         check_identifiers(made)
     else:
-        with pytest.raises(DriveError, match="which cannot be changed or switched off"):
+        with pytest.raises(DriveError, match="that cannot be changed or switched off"):
             check_identifiers(made)
+
+
+UNKNOWN = 0x00FE_0300
+"""Code that no table has."""
+
+
+@pytest.mark.parametrize("apply", [False, True])
+@pytest.mark.parametrize("index", [0x60A9, 0x60AA])
+@settings(max_examples=10)
+@given(code=st.sampled_from([UNKNOWN, 0x00FE_5700, 0xFD00_0000, 0x00C1_FF00]), numerator=st.integers(1, 9))
+def test_a_factor_does_not_stand_for_a_unit_that_is_not_known(
+    apply: bool, index: int, code: int, numerator: int
+) -> None:
+    values = {(each, sub): value for each in (0x6096, 0x6097) for sub, value in ((1, numerator), (2, 1))}
+    key, unit = ("velocity_unit", "rpm") if index == 0x60A9 else ("acceleration_unit", "rpm/s")
+    habits = Habits(values=values, more=((index, 0, 7, "rw", code, False),))
+    for configured in (None, unit):
+        rig = Rig("elmo_gold", habits, **{key: configured, "revolutions_per_metre": 200.0})
+        try:
+            found = inspection.inspect(rig.wires, rig.config, PERIOD, rig.clock, apply=False)[0]
+        finally:
+            rig.drives.close()
+        if configured:
+            assert (found["refused"], found[key]) == ("", unit)
+        else:
+            assert f"object {index:04X} = {code:08X}h is no known unit" in found["refused"]
+            assert f"drives.A.{key}" in found["refused"]
+
+
+def in_micrometres(feed: int | None) -> Rig:
+    """Drives whose positions are in µm and whose velocities are in rpm, with the feed of one revolution [µm]."""
+    units = ((0x60A8, 0xFA01_0000), (0x60A9, 0x00B4_4700), (0x60AA, 0x00C0_0300))
+    values = {(0x6092, 1): feed, (0x6092, 2): 1} if feed else {}
+    more = tuple((index, 0, 7, "rw", code, False) for index, code in units)
+    habits = Habits(frozenset() if feed else frozenset({0x6092}), values, more=more)
+    return Rig("elmo_gold", habits, counts_per_metre=1e6)
+
+
+@settings(max_examples=20)
+@given(feed=st.integers(2, 1_000_000))
+def test_revolutions_per_metre_follow_from_a_feed_constant_in_micrometres(feed: int) -> None:
+    rig = in_micrometres(feed)
+    try:
+        for found in inspection.inspect(rig.wires, rig.config, PERIOD, rig.clock, apply=False):
+            assert (found["refused"], found["velocity_unit"]) == ("", "rev/min")
+        scales = tuple(scale_of("A", drive) for drive in rig.config.each)
+        made = [each for each in survey(rig.wires, rig.config, scales, PERIOD, rig.clock) if isinstance(each, SetUp)]
+        assert made
+        for each in made:
+            assert each.units.velocity_per_metre == pytest.approx(60e6 / feed)
+    finally:
+        rig.drives.close()
+
+
+def test_a_drive_in_micrometres_without_a_feed_constant_is_not_set_to_increments(closing: Closing) -> None:
+    rig = closing(in_micrometres(None))
+    with pytest.raises(DriveError, match=r"set drives\.A\.revolutions_per_metre"):
+        rig.drives.configure(PERIOD)
+
+
+@pytest.mark.parametrize("polarity", [0x00, 0x40, 0x80, 0xC0, 0x21])
+def test_velocities_have_the_sign_of_positions(closing: Closing, polarity: int) -> None:
+    row = (0x607E, 0, 5, "rw", 0, False)
+    there = any(each[0] == 0x607E for each in rows("elmo_gold"))
+    habits = Habits(values={(0x607E, 0): polarity}, more=() if there else (row,))
+    rig = closing(Rig("elmo_gold", habits))
+    if polarity in (0x40, 0x80):
+        with pytest.raises(DriveError, match=rf"drive A: object 607E:00 \(polarity\) is {polarity:02X}h"):
+            rig.drives.configure(PERIOD)
+    else:
+        rig.drives.configure(PERIOD)

@@ -27,6 +27,8 @@ TOLERANCE: Final = 0.01
 _IN_COUNTS: Final = {0x60A9: 0x00B5_0300, 0x60AA: 0x00B5_5700}
 """For each unit object, the code of increments per second or of increments per second squared."""
 _KEYS: Final = {0x60A9: "velocity_unit", 0x60AA: "acceleration_unit"}
+_POLARITIES: Final = 0xC0
+"""Bits of 607Eh that reverse positions and velocities."""
 _FACTORS: Final = {0x60A9: 0x6096, 0x60AA: 0x6097}
 
 
@@ -35,8 +37,8 @@ async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
 
     Raises DriveError if the drive contradicts its configuration, or if a unit in revolutions cannot be converted.
     """
-    remote, counts = drive.remote, abs(scale.counts_per_metre)
-    revolutions = await _revolutions(remote, config, counts)
+    counts = abs(scale.counts_per_metre)
+    revolutions = await _revolutions(drive.remote, config, counts)
     velocity = await _unit(drive, config, 0x60A9, counts, revolutions, velocity_unit)
     acceleration = await _unit(drive, config, 0x60AA, counts, revolutions, acceleration_unit, velocity)
     per_metre = [_per_metre(each, counts, revolutions) for each in (velocity, acceleration)]
@@ -47,6 +49,16 @@ async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
         velocity.name if velocity else "",
         acceleration.name if acceleration else "",
     )
+
+
+async def check_polarity(remote: Remote) -> None:
+    """Raise DriveError if velocities and positions have different signs, which would reverse the velocity offset."""
+    polarity = await remote.peek(0x607E)
+    if polarity is not None and polarity & _POLARITIES not in (0, _POLARITIES):
+        raise DriveError(
+            f"drive {remote.name}: object 607E:00 (polarity) is {polarity & 0xFF:02X}h: bits 7 and 6, of positions "
+            f"and velocities, differ; set them alike, as with [[drives.{remote.name}.write]]"
+        )
 
 
 def _per_metre(unit: Unit | None, counts: float, revolutions: float | None) -> float:
@@ -67,10 +79,12 @@ async def _revolutions(remote: Remote, config: Drive, counts: float) -> float | 
             1.0 / unit.size,
             f"60A8 = {reported:08X}h, {unit.name}",
         )
-    elif unit is not None and unit.base is UnitBase.TURNS:
+    if unit is not None and unit.base is UnitBase.TURNS:
         derived, source = counts * unit.size, f"60A8 = {reported:08X}h, {unit.name}"
     else:
-        for index, name in ((0x6092, "feed constant"), (0x608F, "encoder resolution")):
+        # The feed constant is in units of position, the encoder resolution in increments (CiA 402-2).
+        increments = unit is None or unit.base is UnitBase.COUNTS
+        for index, name in ((0x6092, "feed constant"), *(((0x608F, "encoder resolution"),) if increments else ())):
             per_turn = await _ratio(remote, index)
             if per_turn is not None and per_turn > 1.0:  # 1 means "not used"
                 gear = await _ratio(remote, 0x6091) or 1.0 if index == 0x608F else 1.0
@@ -115,10 +129,15 @@ async def _unit(
     )
     code = await remote.peek(index)
     reported = decoded(code) if code else None
-    source = f"{index:04X} = {code:08X}h" if reported is not None and code is not None else f"{_FACTORS[index]:04X}"
-    if reported is None:
+    source = f"{index:04X} = {code:08X}h" if code else f"{_FACTORS[index]:04X}"
+    if not code:
         reported = await _unit_from_factor(remote, index, velocity)
     if reported is None:
+        if code and configured is None:
+            raise DriveError(
+                f"drive {remote.name}: object {source} is no known unit; find it in the manual, and set "
+                f"drives.{remote.name}.{key}"
+            )
         if configured is not None and configured.per_metre(counts, revolutions) is None:
             raise DriveError(
                 f'drives.{remote.name}.{key} = "{text}" is in revolutions, whose number per metre is unknown; '
@@ -155,6 +174,12 @@ async def _switch_to_counts(drive: Differences, index: int, reported: Unit) -> U
     """Change the drive's unit to counts, because its present unit cannot be converted to metres."""
     wanted = Unit(UnitBase.COUNTS, 1.0, "counts/s" if index == 0x60A9 else "counts/s2")
     code, remote = _IN_COUNTS[index], drive.remote
+    position = await remote.peek(0x60A8)
+    if position and getattr(position_unit(position), "base", None) is not UnitBase.COUNTS:
+        raise DriveError(
+            f"drive {remote.name}: object {index:04X} is {reported.name}, whose revolutions per metre are unknown; set "
+            f"drives.{remote.name}.revolutions_per_metre"
+        )
     drive.note((index, 0), await remote.peek(index), code, "its unit, since its revolutions per metre are unknown")
     try:
         await remote.write(index, 0, code)

@@ -8,7 +8,7 @@ from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Difference, Differences
 from trirail_drivers.cia402.digital_io import check_inputs, configure_outputs
-from trirail_drivers.cia402.drive_units import read_units
+from trirail_drivers.cia402.drive_units import check_polarity, read_units
 from trirail_drivers.cia402.dry_run import DryRun
 from trirail_drivers.cia402.guarding import configure_watchdogs
 from trirail_drivers.cia402.makers_objects import write_makers_objects
@@ -130,6 +130,8 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
         await check_inputs(differences)
     pdos = Pdos(differences, drive.node)
     setpoints, controlword = await pdos.setpoints(mode, velocity_offset=one.velocity_offset)
+    if setpoints.has_velocity:
+        await check_polarity(remote)
     feedback, status, polled, inputs = await pdos.feedback(inputs=bool(one.io.inputs))
     outputs = await pdos.outputs() if one.io.outputs else None
     unused_rpdos, unused_tpdos = await pdos.switch_off_others()

@@ -169,7 +169,7 @@ def check_identifiers(done: Sequence[SetUp]) -> None:
 def _shared_identifier(identifier: int, one: str, other: str) -> DriveError:
     whose = f"drive {one}: more than one PDO has" if one == other else f"drives {one} and {other}: both have a PDO with"
     return DriveError(
-        f"{whose} identifier {identifier:03X}h, which cannot be changed or switched off (1400:01, 1800:01 and on); "
+        f"{whose} identifier {identifier:03X}h that cannot be changed or switched off (1400:01, 1800:01 and on); "
         "give each PDO its own identifier with the manufacturer's tool"
     )
 

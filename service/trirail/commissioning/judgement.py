@@ -107,7 +107,7 @@ def judge_homing(
     if abs(position - offset) > MAX_HOME_DEVIATION:
         words = (
             *words,
-            f"but drives.{drive}.offset is {format_mm(offset)}: check home, unless the slider stopped beyond its switch",
+            f"but drives.{drive}.offset is {format_mm(offset)}: check home, unless it stopped beyond its switch",
         )
     if confirmed:
         return Judgement("ok", words)
