@@ -82,6 +82,16 @@ def replace(path: Path, content: bytes, mode: int = 0o644) -> None:
     _sync_folder(path.parent)
 
 
+def create(path: Path, content: bytes) -> None:
+    """Create a file like `replace`. Raises FileExistsError if it already exists, and OSError."""
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    try:
+        replace(path, content)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
 def make_folder(folder: Path) -> None:
     """Create a folder and its missing parents, and sync them to the disk. Raises OSError."""
     if not folder.is_dir():

@@ -113,7 +113,12 @@ def test_back_leads_past_steps_that_cannot_run(robot: str, typed: int, capsys: p
 
 @pytest.mark.parametrize("done", [[], ["bus"], ["bus", "setup"]], ids=["at once", "before set-up", "afterwards"])
 def test_ctrl_c_ends_it_and_the_report_stays(
-    done: list[str], robot: str, typed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    done: list[str],
+    robot: str,
+    typed: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     os.write(typed, b"\n" * len(done))
     ask, questions = commission.Console.ask, []
@@ -126,8 +131,9 @@ def test_ctrl_c_ends_it_and_the_report_stays(
 
     monkeypatch.setattr(commission.Console, "ask", press)
     with pytest.raises(SystemExit, match="130"):
-        run(robot, "--report", "r.json")
-    report = tmp_path / "r.json"
+        run(robot, "--report", "r.json", "--json")
+    report, printed = tmp_path / "r.json", capsys.readouterr().out
+    assert (json.loads(printed) if printed else None) == (json.loads(report.read_text()) if report.exists() else None)
     assert [step["step"] for step in (json.loads(report.read_text())["steps"] if report.exists() else [])] == done
     assert bool(done) == report.exists() == report.with_suffix(".txt").exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

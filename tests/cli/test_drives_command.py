@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+from trirail.cli import drives_command
 from trirail.cli.app import app
 from trirail.cli.drives_command import UNTESTED_NOTE
 from trirail.config import SIM
+from trirail_drivers import files
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.simulated import SimulatedDrive
 
@@ -116,3 +120,78 @@ def test_a_file_is_never_written_over(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"drive-B\.dcf: a file, not a folder; give a configuration with --config"):
         run("drives", "save", str(tmp_path / "drive-B.dcf"))
     assert [path.name for path in tmp_path.iterdir()] == ["drive-B.dcf"]
+
+
+def test_a_file_that_cannot_be_written_costs_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    replace = files.replace
+
+    def full(path: Path, content: bytes) -> None:
+        if path.name == "drive-B.dcf":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(path, content)
+
+    monkeypatch.setattr(files, "replace", full)
+    assert run("drives", "save", str(tmp_path), "--json") == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["ok"], sorted(told["drives"])) == (False, ["A", "C"])
+    assert list(told["failed"]) == ["B"]
+    assert "No space left" in told["failed"]["B"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drive-A.dcf", "drive-C.dcf"]
+
+
+def test_a_file_made_meanwhile_is_not_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = drives_command._read
+
+    def slow(*words: Any) -> Any:
+        (tmp_path / "drive-A.dcf").write_text("another's")
+        return read(*words)
+
+    monkeypatch.setattr(drives_command, "_read", slow)
+    assert run("drives", "save", str(tmp_path)) == 1
+    assert (tmp_path / "drive-A.dcf").read_text() == "another's"
+    assert (tmp_path / "drive-B.dcf").exists()
+
+
+def dcf(path: Path, product: int, value: str, kind: int = 7, index: int = 0x2000) -> str:
+    """Write a file with one parameter."""
+    section = f"ObjectType=7\nAccessType=rw\nParameterName=X\nDataType={kind}\nParameterValue={value}\n"
+    lists = "".join(
+        f"[{name}]\nSupportedObjects={number}\n" + (f"1=0x{index:04X}\n" if number else "")
+        for name, number in (("MandatoryObjects", 0), ("OptionalObjects", 0), ("ManufacturerObjects", 1))
+    )
+    info = f"[DeviceInfo]\nVendorNumber=1\nProductNumber={product}\n"
+    path.write_text(f"[FileInfo]\nFileName=x\n{info}[{index:04X}]\n{section}{lists}")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("two", "ok", "compared", "only"),
+    [
+        ((1, "5"), True, 1, []),
+        ((2, "5"), False, 1, []),
+        ((1, "6"), False, 1, []),
+        ((1, "5", 7, 0x2001), False, 0, ["2001:00"]),
+    ],
+)
+def test_files_are_alike_only_with_the_same_product_and_something_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], two: Any, ok: bool, compared: int, only: list[str]
+) -> None:
+    paths = dcf(tmp_path / "one.dcf", 1, "5"), dcf(tmp_path / "two.dcf", *two)
+    assert run("drives", "compare", *paths, "--json") == (0 if ok else 1)
+    told = json.loads(capsys.readouterr().out)
+    assert (told["ok"], told["compared"], told["only_other"]) == (ok, compared, only)
+    assert told["identity"]["other"]["product"] == two[0]
+    assert run("drives", "compare", *paths) == (0 if ok else 1)
+    assert all(each in capsys.readouterr().out for each in only)
+
+
+@pytest.mark.parametrize("value", ["inf", "-inf"])
+def test_a_value_that_json_does_not_have_is_a_text(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], value: str
+) -> None:
+    paths = dcf(tmp_path / "one.dcf", 1, value, 8), dcf(tmp_path / "two.dcf", 1, "1.5", 8)
+    assert run("drives", "compare", *paths, "--json") == 1
+    (found,) = json.loads(capsys.readouterr().out)["differences"]
+    assert (found["one"], found["other"]) == (value, 1.5)

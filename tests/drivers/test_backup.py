@@ -26,6 +26,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace as replacement_refusal
 from rigs import Bus, Clock, alike, frame, ideal_servo
 from trirail_drivers.cia402 import backup, inspection, other_masters, parameter_file
+from trirail_drivers.cia402 import eds as eds_file
 from trirail_drivers.cia402.backup import RestoreResult
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.objects import USES, Key
@@ -854,7 +855,7 @@ class TestFileOfAnotherProgram:
             ("0x1388 ; counts/s", "fast", "6081:00: 'fast' is not a value"),
             ("2=100", "2=0x1FFFFFFFF", "607D:02"),
             ("[6083]", "[6081]", "already exists"),
-            ("[6081]", "[6081SUB1]", "belongs to no object"),
+            ("[6081]", "[6081SUB1]", "was not found"),
             ("LowLimit=1", "DataType=0x0006", "already exists"),
             (
                 "DataType=0x0007\nAccessType=rw\nLowLimit=1",
@@ -1053,3 +1054,27 @@ def test_a_text_like_a_negative_number_is_kept(tmp_path: Path, text: str) -> Non
         saved = line.save()
     parameter_file.write(path, saved)
     assert parameter_file.read(path).parameters[0x2100, 0].value == text
+
+
+@settings(max_examples=20)
+@given(sub=st.sampled_from(["sub", "Sub", "SUB", "sUB"]), upper=st.booleans())
+def test_sections_of_sub_objects_are_found_in_any_spelling(
+    tmp_path_factory: pytest.TempPathFactory, sub: str, upper: bool
+) -> None:
+    path = tmp_path_factory.mktemp("eds") / "a.eds"
+    spelt = re.sub(
+        r"\[([0-9A-Fa-f]{4})sub([0-9A-Fa-f]+)\]",
+        lambda found: f"[{found[1].upper() if upper else found[1].lower()}{sub}{found[2]}]",
+        SERVO.read_text(),
+    )
+    path.write_text(spelt)
+    objects, note = eds_file.load("A", path, 1)
+    assert note == ""
+    assert [key for key, _ in variables(objects)] == [key for key, _ in variables(eds_file.read(SERVO, 1))]
+
+
+@pytest.mark.parametrize("name", ["0x1018sub1", "1018 sub1", "1018sub", "1018.1", "101"])
+def test_a_section_that_looks_like_an_object_is_noted(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.eds"
+    path.write_text(SERVO.read_text() + f"\n[{name}]\nParameterName=X\nDataType=7\n")
+    assert f"[{name}] in line" in eds_file.load("A", path, 1)[1]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
+import can
 import pytest
 from canopen import SdoAbortedError
 from drivers.foreign import Habits
@@ -360,7 +362,8 @@ def test_a_factor_does_not_stand_for_a_unit_that_is_not_known(
     key, unit = ("velocity_unit", "rpm") if index == 0x60A9 else ("acceleration_unit", "rpm/s")
     habits = Habits(values=values, more=((index, 0, 7, "rw", code, False),))
     for configured in (None, unit):
-        rig = Rig("elmo_gold", habits, **{key: configured, "revolutions_per_metre": 200.0})
+        keys: dict[str, Any] = {key: configured}
+        rig = Rig("elmo_gold", habits, revolutions_per_metre=200.0, **keys)
         try:
             found = inspection.inspect(rig.wires, rig.config, PERIOD, rig.clock, apply=False)[0]
         finally:
@@ -414,3 +417,15 @@ def test_velocities_have_the_sign_of_positions(closing: Closing, polarity: int) 
             rig.drives.configure(PERIOD)
     else:
         rig.drives.configure(PERIOD)
+
+
+@pytest.mark.parametrize("identifier", [0x601, 0x201, 0x302, 0x000, 0x700 + MASTER])
+@pytest.mark.parametrize("apply", [False, True])
+def test_drives_are_not_read_beside_another_master(identifier: int, apply: bool) -> None:
+    """Its SDO requests would mix with these, and the robot may be moving."""
+    with Line(SERVO) as line:
+        line.bus._arrived.append(can.Message(arbitration_id=identifier, data=bytes(8), is_extended_id=False))  # type: ignore[attr-defined]
+        line.bus.sent.clear()  # type: ignore[attr-defined]
+        with pytest.raises(DriveError, match="another master is on the bus"):
+            inspection.inspect(line.bus, line.drives, 0.001, line.clock, 0.2, apply=apply)
+        assert not line.bus.sent  # type: ignore[attr-defined]

@@ -207,8 +207,10 @@ def test_what_the_set_up_writes_is_refused_and_not_restored(
 
 @pytest.mark.parametrize(
     "name",
-    "CANaddress;CAN node number;Node address;CAN address;Station address;Device ID;CAN_ID;Bit timing;Node-ID;"
-    "CANopen NodeID;Baudrate;CAN bit rate;Node Number;Bus address".split(";"),
+    [
+        *("CANaddress", "CAN node number", "Node address", "CAN address", "Station address", "Device ID", "CAN_ID"),
+        *("Bit timing", "Node-ID", "CANopen NodeID", "Baudrate", "CAN bit rate", "Node Number", "Bus address"),
+    ],
 )
 def test_an_object_with_the_name_of_an_address_is_left(name: str) -> None:
     assert "node id or bitrate" in address((0x3041, 0), name, 1)

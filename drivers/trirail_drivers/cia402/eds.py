@@ -15,7 +15,10 @@ from canopen.objectdictionary import ObjectDictionary
 from trirail_drivers import files
 from trirail_drivers.errors import DriveError, FileError
 
-_OBJECT = re.compile(r"([0-9A-Fa-f]{4})((?:[Ss]ub[0-9A-Fa-f]+)|Name)?")
+_OBJECT = re.compile(r"([0-9A-F]{4})(sub[0-9A-F]+|Name)?", re.IGNORECASE)
+_OTHER_OBJECT = re.compile(r"[0-9A-F]{4}(Value|Denotation|ObjectLinks)|CANopenManager", re.IGNORECASE)
+"""Names of further sections about an object (CiA 306)."""
+_LIKE_OBJECT = re.compile(r"(0x)?[0-9A-F]{3,4}([^A-Z]|sub|$)", re.IGNORECASE)
 _PADDED_DIGIT = re.compile(r"0+([0-7])")
 """Digit from 0 to 7 with leading zeros, which is the same number in decimal and octal."""
 _VERBATIM = ("parametervalue", "defaultvalue")
@@ -62,7 +65,9 @@ def sections_of(text: str) -> tuple[list[Section], list[str]]:
         if not stripped or stripped[0] in ";#":
             continue
         if stripped[0] == "[" and "]" in stripped:
-            now = Section(stripped[1 : stripped.index("]")].strip(), number, {})
+            now = Section(_normalised(stripped[1 : stripped.index("]")].strip()), number, {})
+            if not _OBJECT.fullmatch(now.name) and _LIKE_OBJECT.match(now.name) and not _OTHER_OBJECT.match(now.name):
+                notes.append(f"[{now.name}] in line {number}: no object; expected a name such as [1018] or [1018sub1]")
             if now.name.upper() in sections:
                 twice.append(now)
             else:
@@ -77,6 +82,14 @@ def sections_of(text: str) -> tuple[list[Section], list[str]]:
     notes += [f"[{again.name}] in line {again.line}: for the second time" for again in differing]
     sections.pop("COMMENTS", None)
     return list(sections.values()), notes
+
+
+def _normalised(name: str) -> str:
+    """Return a section's name in the spelling that canopen recognises, such as 1018sub1."""
+    match = _OBJECT.fullmatch(name)
+    if not match or not match[2]:
+        return name
+    return match[1] + ("Name" if match[2].casefold() == "name" else f"sub{match[2][3:]}")
 
 
 def _parse_line(values: dict[str, str], line: str) -> str:

@@ -39,13 +39,11 @@ def inspect(
     With `apply`, the required values are written to all three drives or, if one of them is refused, to none. The drives
     have no power then and do not store the values permanently. Without `apply`, nothing is written. "refused" contains
     the reason if a drive does not answer or is refused. Raises DriveError if `apply` fails, or if another master is on
-    the bus, which could be moving the robot.
+    the bus, which could be moving the robot and whose SDO requests would mix with these.
     """
-    if apply:
-        # A drive may send SYNC until its set-up: 1005h bit 30 is one of the values that are corrected.
-        with exclusive_bus(bus, drives, clock, allow_sync=True) as watched:
-            return _inspect(watched, drives, period, clock, fastest, apply=True, io=io, timing=timing)
-    return _inspect(bus, drives, period, clock, fastest, apply=False, io=io, timing=timing)
+    # A drive may send SYNC until its set-up: 1005h bit 30 is one of the values that are corrected.
+    with exclusive_bus(bus, drives, clock, allow_sync=True) as watched:
+        return _inspect(watched, drives, period, clock, fastest, apply=apply, io=io, timing=timing)
 
 
 def _inspect(

@@ -123,7 +123,7 @@ def origin(numbers: Mapping[str, Any]) -> Origin:
 
 
 def write(path: Path, saved: SavedParameters, bitrate: int | None = None) -> None:
-    """Write a DCF atomically. Raises FileError if it cannot be written."""
+    """Write a new DCF atomically. Raises FileError if the file exists or cannot be written."""
     objects, numbers = saved.objects, saved.origin
     for _, each in variables(objects):  # the drive's EDS may itself be a DCF with values
         vars(each).update(value=None, value_raw=None)
@@ -150,7 +150,7 @@ def write(path: Path, saved: SavedParameters, bitrate: int | None = None) -> Non
     # canopen.export_od is not used, because all files that it writes in a process share one header.
     export_dcf(objects, output, head)  # type: ignore[no-untyped-call]
     try:
-        files.replace(path, output.getvalue().replace("[DeviceComissioning]\n", commissioning, 1).encode())
+        files.create(path, output.getvalue().replace("[DeviceComissioning]\n", commissioning, 1).encode())
     except OSError as error:
         raise FileError(f"{path}: {error.strerror}") from error
 

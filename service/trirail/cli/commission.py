@@ -94,6 +94,10 @@ def commission(
             finally:
                 if keeper.is_saved:
                     person.show(f"Report: {keeper.path} (for people: {keeper.text_path.name})")
+    except KeyboardInterrupt:
+        if json and keeper.is_saved:
+            terminal.json(reports.content(made))
+        raise
     finally:
         keeper.remove_if_empty()
     if json:

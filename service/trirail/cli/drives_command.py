@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
+import msgspec
 from cyclopts import App, Parameter
 from trirail_drivers.errors import DriveError, FileError
 
@@ -110,10 +112,15 @@ def save(
         what = "a file, not a folder; give a configuration with --config" if folder.is_file() else "no such folder"
         raise FileError(f"{folder}: {what}")
     ends = _read(settings, protocol, sorted(paths))
-    read = {name: end for name, end in ends.items() if not isinstance(end, DriveError)}
-    for name, saved in read.items():
-        parameter_file.write(paths[name], saved, settings.can.bitrate)
     failed = {name: str(end) for name, end in ends.items() if isinstance(end, DriveError)}
+    read = {name: end for name, end in ends.items() if not isinstance(end, DriveError)}
+    for name, saved in tuple(read.items()):
+        try:
+            parameter_file.write(paths[name], saved, settings.can.bitrate)
+        except FileError as error:
+            failed[name] = str(error)
+            del read[name]
+    ok = not failed and not any(saved.unanswered for saved in read.values())
     if json:
         files = {
             name: {
@@ -123,8 +130,8 @@ def save(
             }
             for name, saved in read.items()
         }
-        terminal.json({"ok": not failed, "drives": files, "failed": failed})
-        return 1 if failed else 0
+        terminal.json({"ok": ok, "drives": files, "failed": failed})
+        return 0 if ok else 1
     for name, saved in read.items():
         number = len(saved.parameters)
         terminal.print_line(f"drive {name}, node {saved.origin.node}: {number} parameters in {paths[name]}")
@@ -139,7 +146,7 @@ def save(
             )
     for words in failed.values():
         terminal.print_error(words)
-    return 1 if failed else 0
+    return 0 if ok else 1
 
 
 def compare(
@@ -151,7 +158,9 @@ def compare(
     drive: Axis | None = None,
     json: Json = False,
 ) -> int:
-    """Show the parameters that differ between two files, or between a file and the drive; exit 1 if any differ, else 0.
+    """Show the parameters that differ between two files, or between a file and the drive.
+
+    The exit code is 0 if the products are the same and no parameter differs, otherwise 1.
 
     Parameters
     ----------
@@ -174,16 +183,26 @@ def compare(
             raise end
         two, heading = end, f"drive {name}"
     differences = parameter_file.compare(one, two)
+    compared = parameter_file.comparable(one, two)
+    only = [
+        sorted(mine.parameters.keys() - theirs.parameters - {*compared}) for mine, theirs in ((one, two), (two, one))
+    ]
+    is_same_product = (one.origin.vendor, one.origin.product) == (two.origin.vendor, two.origin.product)
+    ok = is_same_product and bool(compared) and not differences
     if json:
         terminal.json(
             {
-                "ok": not differences,
+                "ok": ok,
                 "one": str(file),
                 "other": heading,
+                "identity": {"one": msgspec.to_builtins(one.origin), "other": msgspec.to_builtins(two.origin)},
+                "compared": len(compared),
                 "differences": [_as_json(each) for each in differences],
+                "only_one": [_named(key) for key in only[0]],
+                "only_other": [_named(key) for key in only[1]],
             }
         )
-        return 1 if differences else 0
+        return 0 if ok else 1
     for field in ("vendor", "product", "revision", "serial"):
         mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
         if mine != theirs:
@@ -191,8 +210,11 @@ def compare(
             terminal.print_line(f"{field}: {here} and {there}")
     if differences:
         _print_differences(str(file), heading, [(each, "") for each in differences])
-    terminal.print_line(f"{len(differences)} of {len(parameter_file.comparable(one, two))} parameters differ")
-    return 1 if differences else 0
+    for side, keys in zip((str(file), heading), only, strict=True):
+        if keys:
+            terminal.print_line(f"only in {side}, not compared: {_abbreviate([_named(key) for key in keys])}")
+    terminal.print_line(f"{len(differences)} of {len(compared)} parameters differ")
+    return 0 if ok else 1
 
 
 def restore(
@@ -308,8 +330,13 @@ def _print_differences(one: str, other: str, rows: Iterable[tuple[ParameterDiffe
 
 
 def _as_json(each: ParameterDifference) -> dict[str, Any]:
-    one, other = (None if held is None else held.value for held in (each.one, each.other))
+    one, other = (None if held is None else _json_value(held.value) for held in (each.one, each.other))
     return {"object": _named(each.key), "name": each.name, "one": one, "other": other}
+
+
+def _json_value(value: float | str) -> float | str:
+    """Return a value for JSON, which has no infinity and no NaN."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _value(held: Held | None) -> str:

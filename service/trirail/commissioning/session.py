@@ -71,7 +71,10 @@ class Session:
         fastest = self._config.limits.slider.fastest
         cycle = self._config.period, time.monotonic, fastest
         bus, io, timing = self.environment.bus, self._config.drive_io, self._config.can.timing
-        self._inspected = inspect(bus, drives, *cycle, apply=False, io=io, timing=timing)
+        try:
+            self._inspected = inspect(bus, drives, *cycle, apply=False, io=io, timing=timing)
+        except DriveError as error:
+            return Judgement("failed", (str(error),), "follow the line above, then repeat this step"), {}
         lines = tuple(
             line
             for each in self._inspected
@@ -105,9 +108,12 @@ class Session:
             except DrivesStoppedError as error:
                 return Judgement("failed", (str(error),), "remove the cause, then repeat this step"), {}
             return Judgement("ok", (f"a fault was reset: {fault.message}",)), {}
-        written = sum(len(_changed_values(each)) for each in self._inspected)
-        words = (f"set up, {written} values written, nothing stored; SYNC runs at {self._config.loop.rate_hz} Hz",)
-        return Judgement("ok", words), {"written": written}
+        differed = sum(len(_changed_values(each)) for each in self._inspected)
+        words = (
+            f"set up, nothing stored; {differed} values differed when the bus was read; "
+            f"SYNC runs at {self._config.loop.rate_hz} Hz",
+        )
+        return Judgement("ok", words), {"differed": differed}
 
     def describe_setup(self) -> list[str]:
         """Return lines with the changes that the set-up will make, with one line for a change that drives share."""
