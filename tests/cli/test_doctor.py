@@ -616,3 +616,36 @@ def test_the_routers_are_asked() -> None:
     config = changed(SIMULATED, "zenoh", connect=(nobody,))
     config = changed(config, "loop", realtime="off")
     assert probes.machine(config, quick=True).routers == ((nobody, "connection refused"),)
+
+
+PORTS = st.integers(1, 65535)
+
+
+@given(
+    single=st.lists(PORTS, max_size=3),
+    ranges=st.lists(st.tuples(PORTS, st.integers(0, 20)), max_size=3),
+    counted=st.lists(PORTS, max_size=2),
+)
+def test_ports_of_the_firewall_may_be_ranges(
+    single: list[int], ranges: list[tuple[int, int]], counted: list[int]
+) -> None:
+    elements = [
+        *single,
+        *({"range": [first, first + more]} for first, more in ranges),
+        *({"elem": {"val": port, "comment": "x"}} for port in counted),
+    ]
+    answers = {
+        "tables": {"nftables": [{"table": {"family": "inet", "name": "trirail"}}]},
+        "set": {"nftables": [{"set": {"elem": elements}}]},
+    }
+
+    def run(command: tuple[str, ...], **_: object) -> subprocess.CompletedProcess[bytes]:
+        return subprocess.CompletedProcess(command, 0, json.dumps(answers[command[3]]).encode())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(subprocess, "run", run)
+        assert set(probes.limited_ports() or ()) == {
+            *single,
+            *counted,
+            *(port for first, more in ranges for port in range(first, first + more + 1)),
+        }

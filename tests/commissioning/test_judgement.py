@@ -285,3 +285,23 @@ def test_a_position_away_from_the_configured_home_is_pointed_out(
     judgement = judge_homing(slider, None, offset + beyond, offset, confirmed, "")
     assert judgement.verdict == ("ok" if confirmed else "wrong")
     assert any(f"drives.{slider}.offset" in words for words in judgement.words) == (abs(beyond) > 0.001)
+
+
+@given(moves=st.permutations((0, 1, 2)), makes=st.tuples(*3 * [st.sampled_from((None, "elmo.eds", "maxon.eds"))]))
+def test_node_ids_move_only_between_drives_of_one_make(
+    moves: list[int], makes: tuple[str | None, str | None, str | None]
+) -> None:
+    """A drive takes its dictionary, its units and its own objects with it, which no step writes."""
+    found = drives()
+    for name, eds in zip(NAMES, makes, strict=True):
+        found = msgspec.structs.replace(found, **{name: msgspec.structs.replace(getattr(found, name), eds=eds)})
+    nodes = [drive.node for drive in found.each]
+    proposed = {f"drives.{name}.node": nodes[at] for name, at in zip(NAMES, moves, strict=True)}
+    changes, conflict = merge_changes([proposed, {"drives.A.direction": -1}], found)
+    assert changes["drives.A.direction"] == -1
+    if all(makes[at] == makes[moves[at]] for at in range(3)):
+        assert conflict == ""
+    else:
+        assert set(changes) == {"drives.A.direction"}
+        assert "is that of another make" in conflict
+        assert "eds" in conflict

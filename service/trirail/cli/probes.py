@@ -13,7 +13,7 @@ import socket
 import struct
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -151,9 +151,17 @@ def limited_ports() -> tuple[int, ...] | None:
         command = ("nft", "--json", "list", "set", "inet", "trirail", "ports")
         listed = subprocess.run(command, capture_output=True, check=True, timeout=COMMAND_TIMEOUT_S)
         (ports,) = [each["set"] for each in json.loads(listed.stdout)["nftables"] if "set" in each]
-        return tuple(ports.get("elem", ()))
-    except (OSError, ValueError, KeyError, subprocess.SubprocessError):
+        return tuple(port for each in ports.get("elem", ()) for port in _ports_of(each))
+    except (OSError, ValueError, KeyError, TypeError, subprocess.SubprocessError):
         return None
+
+
+def _ports_of(element: Any) -> Sequence[int]:
+    """Return the ports of an element of a set of nft: a port, a range, or either of them with further properties."""
+    if isinstance(element, dict) and "elem" in element:
+        return _ports_of(element["elem"]["val"])
+    first, last = element["range"] if isinstance(element, dict) else (element, element)
+    return range(first, last + 1)
 
 
 def issued(config: Config) -> tuple[IssuedCertificate, ...] | None:

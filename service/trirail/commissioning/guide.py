@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from trirail_drivers import files
 from trirail_drivers.config import Drives
@@ -24,6 +24,9 @@ from trirail.commissioning.session import StepOutcome
 from trirail.commissioning.steps import Steps
 from trirail.config import Config
 from trirail.errors import ConfigError
+
+KEYS_OF_THE_MAKE: Final = ("eds", "endpoints", "velocity_unit", "acceleration_unit", "accept_without", "write")
+"""Keys of a drive that follow the drive, not the slider, if two node ids are exchanged."""
 
 
 def merge_changes(proposals: Sequence[Changes], drives: Drives) -> tuple[dict[str, int | float], str]:
@@ -44,6 +47,16 @@ def merge_changes(proposals: Sequence[Changes], drives: Drives) -> tuple[dict[st
     if len(set(after.values())) < len(NAMES):
         others = {key: value for key, value in changes.items() if not key.endswith(".node")}
         return others, "two drives moved one slider; check the cables, and repeat those steps"
+    owners = {node: name for name, node in nodes.items()}
+    of = dict(zip(NAMES, drives.each, strict=True))
+    for name, node in after.items():
+        owner = owners.get(node, name)
+        if differing := [key for key in KEYS_OF_THE_MAKE if getattr(of[name], key) != getattr(of[owner], key)]:
+            others = {key: value for key, value in changes.items() if not key.endswith(".node")}
+            return others, (
+                f"drives.{name}.node = {node} is that of another make: exchange the keys of drives.{name} and "
+                f"drives.{owner} by hand, also {', '.join(differing)}"
+            )
     for name, node in after.items():
         changes.pop(f"drives.{name}.node", None)
         if node != nodes[name]:
