@@ -995,7 +995,7 @@ def test_a_restore_that_ends_early_tells_what_it_has_written(tmp_path: Path, ans
 
         line.bus = AlteredBus(line.bus, end)
         with pytest.raises(
-            backup.RestoreAborted, match=r"\d+ of 20 parameters were written: restore it again"
+            backup.RestoreAbortedError, match=r"\d+ of 20 parameters were written: restore it again"
         ) as ended:
             line.restore(saved)
     held = [line.objects[0x2100 + number, 0].value == number for number in range(20)]

@@ -75,7 +75,7 @@ class RestoreResult(NamedTuple):
         return all(each.intended for each in self.left) and not self.not_stored
 
 
-class RestoreAborted(DriveError):
+class RestoreAbortedError(DriveError):
     """A restore ended after some parameters had been written: the drive has parameters of both kinds."""
 
     def __init__(self, drive: str, written: tuple[Key, ...], intended: int, cause: BaseException) -> None:
@@ -132,7 +132,7 @@ def restore(
     except (DriveError, KeyboardInterrupt) as error:
         if not begun.has_begun:
             raise
-        raise RestoreAborted(name, tuple(begun.written), begun.intended, error) from error
+        raise RestoreAbortedError(name, tuple(begun.written), begun.intended, error) from error
     return result
 
 
