@@ -115,7 +115,12 @@ def test_the_greatest_correction_is_that_at_the_corners_of_cells() -> None:
     assert_allclose(made.greatest, np.abs(told_more(made, corners * (1.0 - 1e-12))).max(axis=0), rtol=1e-6)
 
 
-def test_beyond_its_box_it_stays_what_it_is_at_the_border() -> None:
+def small_map(cells: tuple[int, int, int], seed: int) -> Correction:
+    """A map of a part of what is within reach."""
+    return replace(random_map(cells, seed), low=(-0.02, -0.03, -0.1), high=(0.03, 0.02, 0.2))
+
+
+def test_far_beyond_its_box_it_does_not_change() -> None:
     robot = Geometry(PLAIN.legs, replace(random_map((2, 2, 2), 3), low=(-0.02,) * 3, high=(0.02,) * 3))
     inside, outside = (0.01, 0.0, 0.02), (0.01, 0.0, 0.3)
     bare = inverse(PLAIN, [inside, outside]).position
@@ -126,6 +131,37 @@ def test_beyond_its_box_it_stays_what_it_is_at_the_border() -> None:
     still = inverse(robot, outside, (0.0, 0.0, 1.0)).velocity  # c does not change along phi any more
     told = forward(PLAIN, inverse(robot, outside).position)
     assert_allclose(still, inverse(PLAIN, told, (0.0, 0.0, 1.0)).velocity, atol=1e-12)
+
+
+@given(cells=SIZES, seed=SEEDS, axis=st.integers(0, 2), upper=st.booleans(), outside=st.integers(0, 4))
+def test_neither_velocity_nor_acceleration_jumps_at_the_border_or_beyond(
+    cells: tuple[int, int, int], seed: int, axis: int, upper: bool, outside: int
+) -> None:
+    made = small_map(cells, seed)
+    robot, random = Geometry(PLAIN.legs, made), np.random.default_rng(seed)
+    pose = random.uniform(made.low, made.high)
+    border = made.high[axis] + outside * made.size[axis] if upper else made.low[axis] - outside * made.size[axis]
+    pose[axis] = np.clip(border, 0.7 * LOW[axis], 0.7 * HIGH[axis])
+    v, a = random.uniform(-0.3, 0.3, (2, 3))
+    before, after = (inverse(robot, pose + side * np.eye(3)[axis], v, a) for side in (-1e-9, 1e-9))
+    assert_allclose(before.velocity, after.velocity, rtol=0.0, atol=1e-7)
+    assert_allclose(before.acceleration, after.acceleration, rtol=0.0, atol=1e-5)
+
+
+@given(cells=SIZES, seed=SEEDS)
+def test_beyond_its_box_it_adds_no_more_than_inside(cells: tuple[int, int, int], seed: int) -> None:
+    made, random = small_map(cells, seed), np.random.default_rng(seed)
+    poses, way = places(seed), 1e-6 * random.uniform(-1.0, 1.0, 3)
+    added = (made.at(poses + way) - made.at(poses - way)) / 2.0
+    assert (np.abs(added) <= made.adds(np.abs(way)).max(axis=(0, 1, 2)) + 1e-15).all()
+    assert (np.abs(made.at(poses)) <= made.bound * (1.0 + 1e-12)).all()
+
+
+@given(cells=SIZES, seed=SEEDS)
+def test_beyond_its_box_it_is_the_same_for_the_legs_and_in_numpy(cells: tuple[int, int, int], seed: int) -> None:
+    made, poses = small_map(cells, seed), places(seed)
+    told = poses + made.at(poses)
+    assert_allclose(inverse(Geometry(PLAIN.legs, made), poses).position, inverse(PLAIN, told).position, atol=1e-15)
 
 
 @pytest.mark.parametrize("cells", [(1, 1, 1), (3, 2, 5)])

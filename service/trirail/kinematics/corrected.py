@@ -6,6 +6,7 @@ contains the packed Correction of trirail.kinematics.correction if the robot has
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, TypeAlias
 
 from trirail.kinematics.algebra import add, scale, subtract
@@ -27,10 +28,10 @@ Four: TypeAlias = tuple[float, float, float, float]
 class SplineValues(NamedTuple):
     """Values and first two time derivatives of the four splines of one axis that are not zero at a position.
 
-    `first` is the index of the first of these splines.
+    `nodes` are the indices of their nodes. Beyond the border, the outermost node is repeated.
     """
 
-    first: int
+    nodes: tuple[int, int, int, int]
     value: Four
     rate: Four
     change: Four
@@ -43,18 +44,24 @@ def _along(
     """Return the splines of an axis at a position. The first cell of the axis begins at `low`."""
     place = (position - low) * per_length
     rate, change = velocity * per_length, acceleration * per_length
-    if not 0.0 <= place <= cells:  # also True for NaN
-        place = float(cells) if place > cells else 0.0
+    if not -DEGREE <= place <= cells + DEGREE:  # also True for NaN
+        place = float(cells + DEGREE) if place > 0.0 else -float(DEGREE)
         rate = change = 0.0
-    first = min(int(place), cells - 1)
+    first = math.floor(place)
     t = place - first
     s = 1.0 - t
     w = s * s * s / 6.0, (4.0 + t * t * (3.0 * t - 6.0)) / 6.0, (4.0 + s * s * (3.0 * s - 6.0)) / 6.0, t * t * t / 6.0
     d = -0.5 * s * s, t * (1.5 * t - 2.0), -s * (1.5 * s - 2.0), 0.5 * t * t
     dd = s, 3.0 * t - 2.0, 3.0 * s - 2.0, t
     square = rate * rate
+    last = cells + DEGREE - 1
     return SplineValues(
-        first,
+        (
+            min(max(first, 0), last),
+            min(max(first + 1, 0), last),
+            min(max(first + 2, 0), last),
+            min(max(first + 3, 0), last),
+        ),
         w,
         (d[0] * rate, d[1] * rate, d[2] * rate, d[3] * rate),
         (
@@ -82,7 +89,7 @@ def _correction(legs: Array, motion: Matrix) -> Matrix:
             d = x.rate[i] * y.value[j] + x.value[i] * y.rate[j]
             dd = x.change[i] * y.value[j] + 2.0 * x.rate[i] * y.rate[j] + x.value[i] * y.change[j]
             for k in range(DEGREE + 1):
-                at = HEADER_LENGTH + 3 * (((x.first + i) * of_y + y.first + j) * of_z + z.first + k)
+                at = HEADER_LENGTH + 3 * ((x.nodes[i] * of_y + y.nodes[j]) * of_z + z.nodes[k])
                 node = numbers[at], numbers[at + 1], numbers[at + 2]
                 value = add(value, scale(w * z.value[k], node))
                 rate = add(rate, scale(d * z.value[k] + w * z.rate[k], node))

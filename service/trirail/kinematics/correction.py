@@ -2,8 +2,8 @@
 
 To bring the platform to the real pose p, the configured legs must be solved for q = p + c(p). The correction c is a
 tensor product of uniform cubic B-splines in x, y and phi. The splines are twice differentiable, so that accelerations
-remain continuous. Bounds on the slope of c follow from the coefficients. Outside its box, c has the value at the
-border.
+remain continuous. Bounds on the slope of c follow from the coefficients. Outside its box, the outermost nodes are
+repeated: c remains twice differentiable, keeps its bounds, and is constant from DEGREE cells outside the box.
 
 trirail.kinematics.corrected has compiled functions that apply a correction to motions.
 """
@@ -38,19 +38,21 @@ per metre or radian, and the numbers of nodes."""
 def splines(
     poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return the values of all splines at poses (N, 3) as (N, nodes), and the cell indices of the poses, (N, 3).
+    """Return the values of all splines at poses (N, 3) as (N, nodes), and the indices of the nearest cells, (N, 3).
 
     This function uses numpy and is not for use in the cycle, which uses the compiled trirail.kinematics.corrected.
     """
     rows, at = np.ones((len(poses), 1)), np.zeros((len(poses), 3), dtype=np.int64)
     for axis, (begin, end, number) in enumerate(zip(low, high, cells, strict=True)):
-        place = np.clip((poses[:, axis] - begin) / (end - begin) * number, 0.0, number)
-        at[:, axis] = np.minimum(place.astype(np.int64), number - 1)
-        t = place - at[:, axis]
+        place = np.clip((poses[:, axis] - begin) / (end - begin) * number, -DEGREE, number + DEGREE)
+        first = np.floor(place).astype(np.int64)
+        at[:, axis] = np.clip(first, 0, number - 1)
+        t = place - first
         s = 1.0 - t
         values = np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3], axis=1) / 6.0
         along = np.zeros((len(poses), number + DEGREE))
-        np.put_along_axis(along, at[:, axis, None] + np.arange(DEGREE + 1), values, axis=1)
+        nodes = np.clip(first[:, None] + np.arange(DEGREE + 1), 0, number + DEGREE - 1)
+        np.add.at(along, (np.arange(len(poses))[:, None], nodes), values)
         rows = (rows[:, :, None] * along[:, None, :]).reshape(len(poses), -1)
     return rows, at
 
