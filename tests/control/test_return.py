@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from control_rig import ControlRig, PerfectDrives
 from numpy.typing import NDArray
+from refusals import refusal
 from trirail.config import SIM, Config, corrected_geometry, load
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, singular_angles
@@ -198,6 +199,29 @@ def test_no_goal_leads_farther_out(seed: int) -> None:
         assert (excess(name, np.array(rig.control.commanded.pose)) <= most).all()
     assert rig.control.fault is None
     assert rig.mode is Mode.HOLDING
+
+
+@pytest.mark.generated(*range(24))
+def test_no_jog_leads_farther_out_however_slow_it_is(seed: int) -> None:
+    """Nor is one accepted that would move the robot by no more than rounding."""
+    chance = random.Random(seed)
+    name, kind = ROBOTS[seed % len(ROBOTS)], seed % 3
+    limits = config(name).limits.platform
+    high, fastest = (limits.x, limits.y, limits.phi)[kind][1], limits.velocity[kind]
+    pose, velocity = np.zeros(3), np.zeros(3)
+    pose[kind] = high * (1.0 + chance.choice(BEYOND[-2:]))
+    velocity[kind] = fastest * 10.0 ** chance.uniform(-7.0, 0.0)
+    a, b, c = positions(name, pose)[3:6].tolist()
+    rig = ControlRig(config(name), PerfectDrives((a, b, c)))
+    rig.enable()
+    stands = np.array(rig.control.commanded.pose)
+    x, y, phi = velocity.tolist()
+    answer = refusal(rig.send("out", VelocityGoal(x, y, phi, timeout=chance.choice((0.02, 0.1, 1.0)))))
+    assert answer.code == "out_of_workspace"
+    assert "the jog cannot start: the robot would pass the limit of" in answer.message
+    rig.cycles(300)
+    assert rig.control.fault is None
+    assert rig.control.commanded.pose == pytest.approx(stands, rel=0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -153,7 +153,7 @@ def test_beyond_its_box_it_adds_no_more_than_inside(cells: tuple[int, int, int],
     made, random = small_map(cells, seed), np.random.default_rng(seed)
     poses, way = places(seed), 1e-6 * random.uniform(-1.0, 1.0, 3)
     added = (made.at(poses + way) - made.at(poses - way)) / 2.0
-    assert (np.abs(added) <= made.adds(np.abs(way)).max(axis=(0, 1, 2)) + 1e-15).all()
+    assert (np.abs(added) <= made.adds(np.abs(way).tolist()).max(axis=(0, 1, 2)) + 1e-15).all()
     assert (np.abs(made.at(poses)) <= made.bound * (1.0 + 1e-12)).all()
 
 

@@ -16,7 +16,7 @@ from trirail.config import geometry
 from trirail.motion import feasibility
 from trirail.motion.feasibility import Checker, parts
 from trirail.motion.limits import Bounds
-from trirail.motion.path_sampling import survey
+from trirail.motion.path_sampling import MIN_SAMPLES_IN_PIECE, survey
 from trirail.motion.paths import LAST_PIECE_S, Path, constant_law
 from trirail.motion.runs import stretched
 
@@ -55,8 +55,8 @@ def test_a_look_along_a_path_gives_signs_of_life_between_its_parts(knots: int, s
     checker = Checker(geometry(CONFIG.geometry), LIMITS, Bounds(LIMITS, PERIOD), PERIOD, lambda: beats.append(None))
     path = Path(np.linspace(0.0, seconds, knots), np.zeros((knots - 1, 3, 6)))
     checker.worst_shares(path, (0.0, 0.0, 0.0))
-    assert len(beats) == len(parts(path, constant_law(1.0), 0.0, seconds, feasibility.KNOTS_PER_PART))
-    assert len(beats) >= (knots - 2) // feasibility.KNOTS_PER_PART
+    assert len(beats) == len(parts(path, constant_law(1.0), 0.0, seconds, feasibility.SAMPLES_PER_PART))
+    assert len(beats) >= (knots - 1) * (MIN_SAMPLES_IN_PIECE + 1) // feasibility.SAMPLES_PER_PART
 
 
 @pytest.mark.parametrize(("share", "within_limits"), [(0.9, True), (1.5, False)])
@@ -141,17 +141,24 @@ def test_what_plans_and_changes_of_rate_may_use_of_the_platforms_limits() -> Non
 
 
 @given(
-    st.integers(1, 60), st.integers(1, 20), st.sampled_from([0.5, 1.0, 2.0]), st.floats(0.0, 0.4), st.floats(0.5, 1.0)
+    st.lists(st.sampled_from([0.001, 0.05, 0.2, 1.0, 60.0]), min_size=1, max_size=60),
+    st.integers(1, 100),
+    st.sampled_from([0.5, 1.0, 2.0]),
+    st.floats(0.0, 0.4),
+    st.floats(0.5, 1.0),
 )
-def test_the_parts_of_a_path_follow_each_other_and_have_so_many_knots(
-    pieces: int, knots: int, rate: float, begin: float, end: float
+def test_the_parts_of_a_path_follow_each_other_and_have_so_many_samples(
+    durations: list[float], most: int, rate: float, begin: float, end: float
 ) -> None:
-    path = Path(np.linspace(0.0, 1.0, pieces + 1), np.zeros((pieces, 3, 6)))
-    first, until = begin / rate, end / rate
-    found = parts(path, constant_law(rate), first, until, knots)
+    path = Path(np.append(0.0, np.cumsum(durations)), np.zeros((len(durations), 3, 6)))
+    first, until = begin * path.duration / rate, end * path.duration / rate
+    found = parts(path, constant_law(rate), first, until, most)
     times = [first, *(end_of_part for _, end_of_part in found)]
     assert found == list(pairwise(times))
     assert times[-1] == until
-    inside = [((path.knots > rate * a + 1e-9) & (path.knots < rate * b - 1e-9)).sum() for a, b in found]
-    assert max(inside) < knots
-    assert len(found) == 1 + ((path.knots > rate * first) & (path.knots < rate * until)).sum() // knots
+    samples = np.clip(np.array(durations) / 0.03, 4, 16).astype(int) + 1
+    for a, b in found:
+        pieces = samples[(path.knots[1:] > rate * a + 1e-6) & (path.knots[:-1] < rate * b - 1e-6)]
+        assert len(pieces) == 1 or pieces.sum() <= most
+    for (a, _), (_, b) in pairwise(found):
+        assert samples[(path.knots[1:] > rate * a + 1e-6) & (path.knots[:-1] < rate * b - 1e-6)].sum() > most

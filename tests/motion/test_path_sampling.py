@@ -112,6 +112,45 @@ def test_the_greatest_rates_are_those_of_a_closer_look(
     assert (worst[:, :2] <= expected[:, :2] * (1.0 + 1e-2) + 1e-9).all()
 
 
+SHARES = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
+SECONDS = st.sampled_from([0.05, 0.3, 1.0, 4.0])
+LEGS_OF_WAY = st.lists(st.tuples(POSES, SHARES, SHARES, SECONDS), min_size=1, max_size=4)
+WAITS = st.sampled_from([0.0, 10.0, 300.0])
+
+
+def uneven(begin: Pose, legs: list[tuple[Pose, Pose, Pose, float]]) -> Path:
+    """Return a path through points with velocities and accelerations, whose pieces are very different in length."""
+    spans = [*(seconds for *_, seconds in legs), legs[-1][3]]
+    points, t = [Point(0.0, begin, (0.0,) * 3, (0.0,) * 3)], 0.0
+    for (pose, velocity, acceleration, seconds), following in zip(legs, spans[1:], strict=True):
+        t, longer = t + seconds, max(seconds, following)
+        rates = np.multiply(velocity, 0.2 / longer).tolist(), np.multiply(acceleration, 0.5 / longer**2).tolist()
+        points.append(Point(t, pose, *rates))
+    points.append(Point(t + spans[-1], begin, (0.0,) * 3, (0.0,) * 3))
+    return quintic(points, begin)
+
+
+def waiting(path: Path, seconds: float) -> Path:
+    """Return a path that waits at its end."""
+    if not seconds:
+        return path
+    still = np.zeros((1, 3, 6))
+    still[0, :, 0] = path.end
+    return joined([path, Path(np.array([0.0, seconds]), still)])
+
+
+@given(POSES, LEGS_OF_WAY, WAITS)
+def test_no_rate_of_uneven_pieces_is_greater_than_what_is_found(
+    begin: Pose, legs: list[tuple[Pose, Pose, Pose, float]], wait: float
+) -> None:
+    """However long the path waits afterwards. The margin that plans have is of 2 % for accelerations, 4 % for jerks."""
+    path = uneven(begin, legs)
+    expected = looked_at(path, 1.0, 2 * round(path.duration / STEP) + 1).worst
+    leaves_at, worst = surveyed(waiting(path, wait), 1.0, even=64)
+    assert math.isnan(leaves_at)
+    assert (expected <= worst * (1.002, 1.01, 1.03) + 1e-6).all()
+
+
 @given(POSES, POSES, st.floats(0.5, 3.0))
 def test_a_jerk_that_is_greatest_just_before_the_end_is_seen(begin: Pose, end: Pose, seconds: float) -> None:
     """It grows evenly, from none at the beginning; however far apart the moments are, the last cycle is looked at."""
@@ -169,3 +208,21 @@ def test_a_turn_beyond_a_limit_between_two_looks_is_seen(
         if not inside:
             beyond = seen.times[outward > most + room]
             assert beyond[0] - 2e-4 <= leaves_at <= beyond[-1] + 2e-4
+
+
+@settings(max_examples=150)
+@given(POSES, LEGS_OF_WAY, WAITS, st.integers(0, 4), st.integers(0, 1))
+def test_a_turn_of_uneven_pieces_beyond_a_limit_is_seen(
+    begin: Pose, legs: list[tuple[Pose, Pose, Pose, float]], wait: float, column: int, side: int
+) -> None:
+    """Also if a position turns twice between two looks."""
+    path = uneven(begin, legs)
+    seen = looked_at(path, 1.0, 20001)
+    outward = (seen.places[:, COLUMNS[column]] * (1.0 if side else -1.0)).max(axis=1)
+    most = outward.max()
+    assume(most > max(outward[0], outward[-1]) + 1e-3)
+    for room, inside in ((3e-6, True), (-1e-6, False)):
+        box = ANYWHERE.copy()
+        box[side, COLUMNS[column]] = (most + room) * (1.0 if side else -1.0)
+        leaves_at, _ = surveyed(waiting(path, wait), 1.0, box)
+        assert math.isnan(leaves_at) is inside

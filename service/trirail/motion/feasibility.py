@@ -15,8 +15,17 @@ from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import COORDINATES, Bounds, Violation, standing_tolerance
-from trirail.motion.path_sampling import survey
-from trirail.motion.paths import ROUNDING, Path, constant_law, evaluate, law_falls, passing_time, platform_at_law_time
+from trirail.motion.path_sampling import MAX_SAMPLES_IN_PIECE, MIN_SAMPLES_IN_PIECE, PIECE_SAMPLE_INTERVAL_S, survey
+from trirail.motion.paths import (
+    OUTWARD_ROUNDING,
+    ROUNDING,
+    Path,
+    constant_law,
+    evaluate,
+    law_falls,
+    passing_time,
+    platform_at_law_time,
+)
 from trirail.motion.runs import ZERO_RATES
 
 SLIDER_PLAN_SHARES = (0.98, 0.98, 0.93)
@@ -41,8 +50,8 @@ SAMPLE_INTERVAL_S = 0.005
 20 ms, an acceleration between two samples was once 1.4 % higher than at both samples, during a change of rate."""
 MIN_SAMPLES, MAX_SAMPLES = 16, 64
 """Least and greatest number of evenly spaced samples per call."""
-KNOTS_PER_PART = 48
-"""Number of knots of a path that are sampled in one call. Each call takes at least MIN_SAMPLES samples."""
+SAMPLES_PER_PART = 240
+"""Number of samples in and next to pieces of a path that are taken in one call, besides the evenly spaced samples."""
 SLOWDOWN_EXPONENTS = 1.0 / np.arange(1.0, 4.0)
 """Exponents that convert factors of velocity, acceleration and jerk into a factor of time."""
 
@@ -83,19 +92,25 @@ def most_exceeded(worst: Array) -> str:
     return SUBJECTS[int((worst**SLOWDOWN_EXPONENTS).max(axis=1).argmax())]
 
 
-def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list[tuple[float, float]]:
-    """Divide an interval of a law's time into parts, each with at most `knots` knots of the path.
+def parts(path: Path, law: Path, first: float, until: float, samples: int) -> list[tuple[float, float]]:
+    """Divide an interval of a law's time into parts, each with at most `samples` samples in and next to pieces.
 
-    Returns the start and the end of each part [s].
+    A piece is not divided, even if it has more samples. Returns the start and the end of each part [s].
     """
     at = np.zeros((3, 1))
     evaluate(law.knots, law.pieces, first, at)
-    begin = int(np.searchsorted(path.knots, at[0, 0], side="right"))
+    begin = max(0, int(np.searchsorted(path.knots, at[0, 0], side="right")) - 1)
     evaluate(law.knots, law.pieces, until, at)
     end = int(np.searchsorted(path.knots, at[0, 0]))
-    between = path.knots[begin + knots - 1 : end : knots].tolist()
-    times = [first, *(passing_time(law.knots, law.pieces, s, until) for s in between), until]
-    return list(pairwise(times))
+    numbers = np.diff(path.knots[begin : end + 1]) / PIECE_SAMPLE_INTERVAL_S
+    totals = np.cumsum(np.clip(numbers, MIN_SAMPLES_IN_PIECE, MAX_SAMPLES_IN_PIECE).astype(np.int64) + 1)
+    times, piece = [first], 0
+    while True:
+        taken = totals[piece - 1] if piece else 0
+        piece = max(piece + 1, int(np.searchsorted(totals, taken + samples, side="right")))
+        if piece >= len(totals):
+            return list(pairwise([*times, until]))
+        times.append(passing_time(law.knots, law.pieces, path.knots[begin + piece], until))
 
 
 def _positions(motion: Array, rows: Array) -> Array:
@@ -199,7 +214,7 @@ class Checker:
             The path leaves the workspace.
         """
         law, worst = constant_law(1.0), np.zeros((len(SUBJECTS), 3))
-        for first, until in parts(path, law, 0.0, path.duration, KNOTS_PER_PART):
+        for first, until in parts(path, law, 0.0, path.duration, SAMPLES_PER_PART):
             result = self.sample(path, law, first, until, pose)
             if not math.isnan(result.leaves_at):
                 raise self.refusal(path, result.leaves_at, pose)
@@ -253,6 +268,8 @@ class Checker:
         return self._violation(_positions(*rows), _positions(*begin) if begin is not None else None)
 
     def _violation(self, positions: Array, begin: Array | None = None) -> Violation | None:
-        low, high = self._box if begin is None else (np.minimum(self._box[0], begin), np.maximum(self._box[1], begin))
-        beyond = np.flatnonzero((positions < low - ROUNDING) | (positions > high + ROUNDING))
+        low, high = self._box[0] - ROUNDING, self._box[1] + ROUNDING
+        if begin is not None:
+            low, high = np.minimum(low, begin - OUTWARD_ROUNDING), np.maximum(high, begin + OUTWARD_ROUNDING)
+        beyond = np.flatnonzero((positions < low) | (positions > high))
         return self._bounds.position_violation(int(beyond[0]), float(positions[beyond[0]])) if len(beyond) else None

@@ -15,7 +15,7 @@ from trirail.config import Limits
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import LEGS
-from trirail.motion.paths import ROUNDING
+from trirail.motion.paths import OUTWARD_ROUNDING, ROUNDING
 from trirail.naming import Labels
 from trirail.quantities import beyond, worded
 
@@ -24,8 +24,6 @@ UNITS = ("m", "m", "rad")
 
 SETPOINT_TOLERANCE = 1e-6
 """Distance by which a setpoint may exceed a position limit that was used for planning [m, rad]."""
-OUTWARD_ROUNDING = 1e-12
-"""Outward motion per cycle, beyond a limit, that is treated as rounding [m, rad]."""
 MAX_RELATIVE_EXCESS = 1e-3
 """Relative amount by which a setpoint may exceed the velocity, acceleration and jerk limits that were used for
 planning."""
@@ -325,11 +323,10 @@ class Bounds:
     def pose_violation_from(self, pose: ArrayLike, start: Sequence[float]) -> Violation | None:
         """Return the first violation by a pose, but accept a coordinate that is no farther outside than at `start`."""
         values = np.array(pose, dtype=np.float64)
-        low, high = self.box
-        edge = float(self.packed[0]["edge"])
-        outside = (
-            (values < np.minimum(low - edge, start)) | (values > np.maximum(high + edge, start)) | np.isnan(values)
-        )
+        edge, begin = float(self.packed[0]["edge"]), np.array(start)
+        low = np.minimum(self.box[0] - edge, begin - OUTWARD_ROUNDING)
+        high = np.maximum(self.box[1] + edge, begin + OUTWARD_ROUNDING)
+        outside = (values < low) | (values > high) | np.isnan(values)
         return self.position_violation(int(np.argmax(outside)), float(values[outside][0])) if outside.any() else None
 
     def standing_violation(self, positions: Array, tolerance: Array) -> Violation | None:

@@ -14,7 +14,7 @@ from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.feasibility import ROUNDING_FACTOR, Checker, SampleResult, most_exceeded, slowdown_factor
 from trirail.motion.limits import COORDINATES, UNITS, Bounds
-from trirail.motion.paths import Path, constant_law
+from trirail.motion.paths import ROUNDING, Path, constant_law
 from trirail.motion.quintic import Point, check_ends, quintic
 from trirail.motion.ruckig_call import Kinodynamic, Solver
 from trirail.motion.runs import (
@@ -233,7 +233,10 @@ class PathPlanner:
         for _ in range(MAX_JOG_PLANS):
             asked = [share / slower * value for value in velocity]
             limits = _scaled_limits(self.platform, slower, softer)
-            ramp, brake, path = self._jog_path(tool_motion(start, tool), asked, hold, tool, limits)
+            begin = tool_motion(start, tool)
+            ramp, brake, path = self._jog_path(begin, asked, hold, tool, limits)
+            if bound is not None and np.abs(path.end - begin.pose).max() <= ROUNDING:
+                break
             result = self.checker.sample(path, constant_law(1.0), 0.0, path.duration, start.pose)
             if result.fits or (result.within_limits and not start.at_rest):
                 return Plan(path, slowed(slower / share), bound)

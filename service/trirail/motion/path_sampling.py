@@ -7,29 +7,41 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.kinematics.arrays import Array
+from trirail.kinematics.arrays import Array, Vector
 from trirail.kinematics.closed_forward import LEGS_TYPE, sign_of_det_j2
 from trirail.kinematics.closure import inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.recursion import ZERO
-from trirail.motion.paths import BISECTIONS, ROUNDING, law_at, passing_time, platform_at, tool_at, transfer_to_point
+from trirail.motion.paths import (
+    BISECTIONS,
+    OUTWARD_ROUNDING,
+    ROUNDING,
+    law_at,
+    passing_time,
+    platform_at,
+    tool_at,
+    transfer_to_point,
+)
 
 __all__ = ["survey"]
 
-TURN_CLEARANCE = 1e-3
-"""Distance from a limit within which the turning point of a position is computed exactly [m, rad]."""
 UNIT_WEIGHTS = (1.0, 1.0, 1.0)
 MIN_END_ACCELERATION = 1e-9
 """Acceleration of the sliders at an end of a path below which the path counts as ending without acceleration [m/s²]."""
 RETURN_SLOWDOWN = 10.0
 """Factor by which velocities are reduced while the robot returns from outside its limits."""
 MIN_PEAK = 1.0 + 1e-4
-"""Estimated peak of a velocity between two samples above which the peak is computed, relative to the greatest velocity
-of the earlier samples."""
+"""Estimated peak of a rate between two samples above which the peak is computed, relative to the greatest value of the
+earlier samples."""
 PEAK_BISECTIONS = 6
 """Number of bisection steps after which the error of a peak of the velocity is below a thousandth."""
-SAMPLES_PER_PIECE = 4
-"""Number of samples in every piece of a path."""
+MIN_SAMPLES_IN_PIECE, MAX_SAMPLES_IN_PIECE = 4, 16
+"""Least and greatest number of samples in every piece of a path."""
+PIECE_SAMPLE_INTERVAL_S = 0.03
+"""Interval of the samples in a piece, if their number allows this interval [s]."""
+MAX_VELOCITY_RISE = 0.25
+"""Upper bound for the rise of a velocity between two samples, as a fraction of the interval times the sum of both
+accelerations. For a cubic, the fraction is at most 4/27."""
 
 
 @compiled()
@@ -42,6 +54,12 @@ def _insert_time(times: Array, n: int, time: float, first: float, until: float) 
 
 
 @compiled()
+def _samples_in_piece(duration: float) -> int:
+    """Return the number of samples in a piece of a path with a duration [s]."""
+    return int(min(max(duration / PIECE_SAMPLE_INTERVAL_S, MIN_SAMPLES_IN_PIECE), MAX_SAMPLES_IN_PIECE))
+
+
+@compiled()
 def _sample_times(
     knots: Array, law_knots: Array, law_pieces: Array, first: float, until: float, even: int, step: float
 ) -> Array:
@@ -51,22 +69,28 @@ def _sample_times(
     that begins at the knot are therefore sampled. The mean jerk of any step across the knot is between their mean
     jerks.
     """
-    times = np.empty(even + (SAMPLES_PER_PIECE + 1) * len(knots) + 2 * len(law_knots))
+    begin = law_at(law_knots, law_pieces, first)[0]
+    end = law_at(law_knots, law_pieces, until)[0]
+    low, high = 0, len(knots) - 1  # first and last knot of the pieces between `begin` and `end`
+    while low < high and knots[low + 1] < begin:
+        low += 1
+    while high > low and knots[high - 1] > end:
+        high -= 1
+    times = np.empty(even + (MAX_SAMPLES_IN_PIECE + 1) * (high - low + 1) + 2 * len(law_knots))
     for k in range(even):
         times[k] = first + (until - first) * k / (even - 1)
     n = even
-    begin = law_at(law_knots, law_pieces, first)[0]
-    end = law_at(law_knots, law_pieces, until)[0]
-    for k in range(len(knots)):
-        for part in range(SAMPLES_PER_PIECE if k < len(knots) - 1 else 1):
-            s = knots[k]
-            if part:
-                s += (knots[k + 1] - knots[k]) * part / SAMPLES_PER_PIECE
-            if begin <= s <= end:
-                time = passing_time(law_knots, law_pieces, s, until)
-                n = _insert_time(times, n, time, first, until)
-                if not part:
-                    n = _insert_time(times, n, time - step, first, until)
+    last = 0.0
+    for k in range(low, high + 1):
+        time = passing_time(law_knots, law_pieces, knots[k], until)
+        if k > low:
+            number = _samples_in_piece(knots[k] - knots[k - 1])
+            for part in range(1, number):
+                n = _insert_time(times, n, last + (time - last) * part / number, first, until)
+        if begin <= knots[k] <= end:
+            n = _insert_time(times, n, time, first, until)
+            n = _insert_time(times, n, time - step, first, until)
+        last = time
     for knot in law_knots:
         n = _insert_time(times, n, knot, first, until)
         n = _insert_time(times, n, knot - step, first, until)
@@ -74,21 +98,24 @@ def _sample_times(
 
 
 @compiled()
-def _limited_position(motion: Array, sliders: Array, i: int) -> tuple[float, float]:
-    """Return position i and its velocity. The nine positions with limits are x, y, phi, sliders and cross slides."""
+def _limited_position(motion: Array, sliders: Array, i: int) -> Vector:
+    """Return position i, its velocity and its acceleration.
+
+    The nine positions with limits are x, y, phi, sliders and cross slides.
+    """
     if i < 3:
-        return motion[0, i], motion[1, i]
+        return motion[0, i], motion[1, i], motion[2, i]
     if i < 6:
-        return sliders[0, i - 3], sliders[1, i - 3]
-    return sliders[3, i - 6], sliders[4, i - 6]
+        return sliders[0, i - 3], sliders[1, i - 3], sliders[2, i - 3]
+    return sliders[3, i - 6], sliders[4, i - 6], sliders[5, i - 6]
 
 
 class PathProblem(NamedTuple):
     """Path and law to be sampled, with the robot and its limits.
 
-    `box` (2, 9) holds the position limits. `reach` (2, 9) holds the limits that apply to this path. If a position
-    starts outside its limits, `reach` is extended to this position, and shrinks as the position moves inwards.
-    Otherwise, `reach` equals `box`.
+    `box` (2, 9) holds the position limits, extended by ROUNDING. `reach` (2, 9) holds the limits that apply to this
+    path. If a position starts outside its limits, `reach` is extended to this position, and shrinks as the position
+    moves inwards. Otherwise, `reach` equals `box`.
     """
 
     legs: Array
@@ -115,7 +142,7 @@ def _initialise_reach(problem: PathProblem, time: float, near: Array, tolerance:
         return -1
     beyond = 0
     for i in range(9):
-        position, _ = _limited_position(motion, sliders, i)
+        position, _, _ = _limited_position(motion, sliders, i)
         problem.reach[0, i], problem.reach[1, i] = min(problem.box[0, i], position), max(problem.box[1, i], position)
         if max(problem.box[0, i] - position, position - problem.box[1, i]) > tolerance[i]:
             beyond = 1
@@ -126,7 +153,7 @@ def _initialise_reach(problem: PathProblem, time: float, near: Array, tolerance:
 def _narrow_reach(problem: PathProblem, motion: Array, sliders: Array) -> None:
     """Shrink `reach` while a position returns from outside its limits. The position cannot move out again."""
     for i in range(9):
-        position, _ = _limited_position(motion, sliders, i)
+        position, _, _ = _limited_position(motion, sliders, i)
         problem.reach[0, i] = min(problem.box[0, i], max(problem.reach[0, i], position))
         problem.reach[1, i] = max(problem.box[1, i], min(problem.reach[1, i], position))
 
@@ -145,14 +172,36 @@ def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sli
     if inverse_motion(problem.legs, motion, sliders) != 0:
         return False
     for i in range(9):
-        position, _ = _limited_position(motion, sliders, i)
-        if not problem.reach[0, i] - ROUNDING <= position <= problem.reach[1, i] + ROUNDING:
+        position, _, _ = _limited_position(motion, sliders, i)
+        if not problem.reach[0, i] - OUTWARD_ROUNDING <= position <= problem.reach[1, i] + OUTWARD_ROUNDING:
             return False
     phi = motion[0, 2]
-    if problem.box[0, 2] - ROUNDING <= phi <= problem.box[1, 2] + ROUNDING:
+    if problem.box[0, 2] <= phi <= problem.box[1, 2]:
         return True
     # J2 is regular within the limits of phi. Outside these limits, a singular angle may be on the way back.
     return sign_of_det_j2(problem.legs, (motion[0, 0], motion[0, 1], phi)) == sign_of_det_j2(problem.legs, ZERO)
+
+
+@compiled()
+def _find_zero(
+    problem: PathProblem, i: int, order: int, low: float, high: float, near: Array, motion: Array, sliders: Array
+) -> tuple[float, bool]:
+    """Return the time at which a derivative of position i is zero, by bisection, and False if it is out of reach.
+
+    The derivative of the given order has different signs at the times `low` and `high`. `motion` (3, 3) and `sliders`
+    (6, 3) hold the sample at `high`, and afterwards the sample at the last time of the bisection.
+    """
+    sign = _limited_position(motion, sliders, i)[order]
+    middle = high
+    for _ in range(BISECTIONS // 3):
+        middle = (low + high) / 2.0
+        if not _solve_at(problem, middle, near, motion, sliders):
+            return middle, False
+        if _limited_position(motion, sliders, i)[order] * sign < 0.0:
+            low = middle
+        else:
+            high = middle
+    return middle, True
 
 
 @compiled()
@@ -161,48 +210,96 @@ def _find_turn_beyond_limit(
 ) -> float:
     """Return a time at which a position that turns between two samples is out of reach; NaN if there is none.
 
-    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the samples at `last` and `time`, and space for a third sample.
+    `motion` (4, 3, 3) and `sliders` (4, 6, 3) hold the samples at `last` and `time`, and space for a third sample.
     """
+    span = time - last
     for i in range(9):
-        before, leaving = _limited_position(motion[0], sliders[0], i)
-        _, coming = _limited_position(motion[1], sliders[1], i)
-        if leaving * coming >= 0.0:
+        before, leaving, begin = _limited_position(motion[0], sliders[0], i)
+        after, coming, end = _limited_position(motion[1], sliders[1], i)
+        once = leaving * coming < 0.0
+        # With constant jerk, the velocity falls by half of `fall` and rises again, or it rises and falls again.
+        fall = begin * begin / abs(begin - end) * span if begin * end < 0.0 else 0.0
+        if not once and (leaving * begin >= 0.0 or fall <= abs(leaving)):
             continue
-        # Estimate the turning point, assuming constant acceleration.
-        turn = before + leaving * leaving / (leaving - coming) * (time - last) / 2.0
-        if problem.box[0, i] + TURN_CLEARANCE <= turn <= problem.box[1, i] - TURN_CLEARANCE:
+        speed = max(abs(leaving), abs(coming)) + MAX_VELOCITY_RISE * span * (abs(begin) + abs(end))
+        if (
+            problem.box[0, i] <= min(before, after) - span * speed
+            and max(before, after) + span * speed <= problem.box[1, i]
+        ):
             continue
-        low, high = last, time
-        for _ in range(BISECTIONS // 3):
-            middle = (low + high) / 2.0
-            if not _solve_at(problem, middle, near, motion[2], sliders[2]):
-                return middle
-            _, velocity = _limited_position(motion[2], sliders[2], i)
-            if velocity * leaving > 0.0:
-                low = middle
-            else:
-                high = middle
+        motion[2], sliders[2] = motion[1], sliders[1]
+        if once:
+            turn, within = _find_zero(problem, i, 1, last, time, near, motion[2], sliders[2])
+            if not within:
+                return turn
+            continue
+        middle, within = _find_zero(problem, i, 2, last, time, near, motion[2], sliders[2])
+        if not within:
+            return middle
+        if _limited_position(motion[2], sliders[2], i)[1] * leaving >= 0.0:
+            continue
+        turn, within = _find_zero(problem, i, 1, last, middle, near, motion[2], sliders[2])
+        if not within:
+            return turn
+        motion[2], sliders[2] = motion[1], sliders[1]
+        turn, within = _find_zero(problem, i, 1, middle, time, near, motion[2], sliders[2])
+        if not within:
+            return turn
     return math.nan
 
 
 @compiled()
-def _measure_peaks(
-    problem: PathProblem, last: float, time: float, near: Array, motion: Array, sliders: Array, worst: Array
-) -> None:
-    """Update the greatest velocities `worst` (6, 3) where a velocity has a peak between two samples.
+def _peak_of_cubic(begin: float, end: float, slope: float, end_slope: float) -> tuple[float, float]:
+    """Return the place between 0 and 1 of the extremum of a cubic, and its value there.
 
-    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the samples at `last` and `time`, and space for a third sample. Only
-    the coordinates of the path are measured: if it moves another point, x and y of the centre are not among them.
+    The cubic is given by its values and slopes at 0 and 1. The slopes have different signs.
     """
+    rise = end - begin
+    a, b = slope + end_slope - 2.0 * rise, 3.0 * rise - 2.0 * slope - end_slope
+    # The derivative is 3 a u² + 2 b u + slope, which is zero where u = (-b -+ root) / 3a = slope / (-b -+ root).
+    root = math.sqrt(max(0.0, b * b - 3.0 * a * slope))
+    q = -(b + math.copysign(root, b))
+    u = slope / q
+    if not 0.0 <= u <= 1.0:
+        u = q / (3.0 * a)
+    return u, begin + u * (slope + u * (b + u * a))
+
+
+@compiled()
+def _measure_peaks(
+    problem: PathProblem,
+    last: float,
+    time: float,
+    near: Array,
+    motion: Array,
+    sliders: Array,
+    jerks: Array,
+    worst: Array,
+) -> None:
+    """Update the maxima `worst` (6, 3) where a velocity or an acceleration has a peak between two samples.
+
+    `motion` (4, 3, 3) and `sliders` (4, 6, 3) hold the samples at `last` and `time`, and space for a third sample.
+    `jerks` (2, 6) are the jerks of x, y, phi and the sliders at these two samples. Only the coordinates of the path are
+    measured: if it moves another point, x and y of the centre are not among them.
+    """
+    span = time - last
     for i in range(2 if len(problem.tools) else 0, 6):
         of_slider, n = i >= 3, i % 3
         states = sliders if of_slider else motion
-        row, weight = (0, problem.shares[0, n]) if of_slider else (1 + n, 1.0)
+        row = 0 if of_slider else 1 + n
         begin, end = states[0, 2, n], states[1, 2, n]
+        if jerks[0, i] * jerks[1, i] < 0.0:
+            share, peak = _peak_of_cubic(begin, end, jerks[0, i] * span, jerks[1, i] * span)
+            weight = problem.shares[1, n] if of_slider else 1.0
+            if weight * abs(peak) > worst[row, 1] * MIN_PEAK:
+                if not _solve_at(problem, last + share * span, near, motion[2], sliders[2]):
+                    return
+                worst[row, 1] = max(worst[row, 1], weight * abs(states[2, 2, n]))
         if begin * end >= 0.0:
             continue
         # With constant jerk, the velocity would rise by half of this value.
-        rise = begin * begin / abs(begin - end) * (time - last)
+        rise = begin * begin / abs(begin - end) * span
+        weight = problem.shares[0, n] if of_slider else 1.0
         if weight * (abs(states[0, 1, n]) + rise) <= worst[row, 0] * MIN_PEAK:
             continue
         low, high = last, time
@@ -246,23 +343,23 @@ def _measure_rates(
 
 @compiled()
 def _measure_tool(
-    problem: PathProblem, time: float, motion: Array, arms: Array, step: float, whole: bool, worst: Array
+    problem: PathProblem, time: float, now: Array, then: Array, arms: Array, step: float, whole: bool, worst: Array
 ) -> None:
     """Update the maxima `worst` with the rates of the tool, and with those of the centre if the tool is another point.
 
-    `motion` (3, 3, 3) holds the motion of the platform one step later and at `time`. `arms` (2, 3, 3) is space for the
-    tool's motion.
+    `now` and `then` (3, 3) hold the motion of the platform at `time` and one step later. `arms` (2, 3, 3) is space for
+    the tool's motion.
     """
     u, v = tool_at(problem.knots, problem.tools, law_at(problem.law_knots, problem.law_pieces, time)[0])
-    arms[:] = motion[:2]
+    arms[0], arms[1] = now, then
     if u != 0.0 or v != 0.0:
         # Use the same point one step later, even if a piece for another point begins in between.
         transfer_to_point(arms[0], u, v)
         transfer_to_point(arms[1], u, v)
         for i in range(2):
-            _measure_rates(motion[1], motion[0], i, step, whole, worst[4 + i])
+            _measure_rates(now, then, i, step, whole, worst[4 + i])
     for i in range(3):
-        _measure_rates(arms[1], arms[0], i, step, whole, worst[1 + i])
+        _measure_rates(arms[0], arms[1], i, step, whole, worst[1 + i])
 
 
 @compiled()
@@ -273,30 +370,38 @@ def _sample_path(
 
     Returns the last time that was found within reach, and a later time out of reach (NaN if there is none).
     """
-    motion, sliders, arms = np.empty((3, 3, 3)), np.empty((3, 6, 3)), np.empty((2, 3, 3))
-    last = -math.inf
+    # The samples are: the previous one, the present one, space for one in between, and the one a step later.
+    motion, sliders, arms = np.empty((4, 3, 3)), np.empty((4, 6, 3)), np.empty((2, 3, 3))
+    jerks = np.empty((2, 6))
+    before = last = -math.inf
     for k in range(len(times)):
         time = times[k]
         if abs(time - last) < ROUNDING:
-            motion[1], sliders[1] = motion[0], sliders[0]
+            motion[1], sliders[1] = motion[3], sliders[3]
         elif not _solve_at(problem, time, near, motion[1], sliders[1]):
-            return last, time
-        elif time > last + step and k > 0:
-            leaves_at = _find_turn_beyond_limit(problem, last, time, near, motion, sliders)
+            return before, time
+        if k > 0 and time > before + ROUNDING:
+            leaves_at = _find_turn_beyond_limit(problem, before, time, near, motion, sliders)
             if not math.isnan(leaves_at):
-                return last, leaves_at
-            _measure_peaks(problem, last, time, near, motion, sliders, worst)
+                return before, leaves_at
         if time >= 0.0:
             _narrow_reach(problem, motion[1], sliders[1])
         last = time + step
-        if not _solve_at(problem, last, near, motion[0], sliders[0]):
+        if not _solve_at(problem, last, near, motion[3], sliders[3]):
             return time, last
+        for i in range(3):
+            jerks[1, i] = (motion[3, 2, i] - motion[1, 2, i]) / step
+            jerks[1, 3 + i] = (sliders[3, 2, i] - sliders[1, 2, i]) / step
+        if k > 0 and time > before + ROUNDING:
+            _measure_peaks(problem, before, time, near, motion, sliders, jerks, worst)
         whole = time >= 0.0 and last <= until  # False for the first step from rest and the last step to rest
         for i in range(3):
             weights = problem.shares[0, i], problem.shares[1, i], problem.shares[2, i]
-            _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0], weights)
-        _measure_tool(problem, time, motion, arms, step, whole, worst)
-    return last, math.nan
+            _measure_rates(sliders[1], sliders[3], i, step, whole, worst[0], weights)
+        _measure_tool(problem, time, motion[1], motion[3], arms, step, whole, worst)
+        before = time
+        motion[0], sliders[0], jerks[0] = motion[1], sliders[1], jerks[1]
+    return before, math.nan
 
 
 @compiled()
@@ -306,7 +411,7 @@ def _measure_jump(problem: PathProblem, edge: float, time: float, step: float, n
     The setpoint next to the standstill may lie anywhere within the first or last step of the path, which ends or begins
     at `time`. The jerk of that step is therefore added to the jump of the acceleration.
     """
-    motion, sliders, arms = np.empty((3, 3, 3)), np.empty((3, 6, 3)), np.empty((2, 3, 3))
+    motion, sliders, arms = np.empty((2, 3, 3)), np.empty((2, 6, 3)), np.empty((2, 3, 3))
     if not _solve_at(problem, edge, near, motion[0], sliders[0]) or np.abs(sliders[0, 2]).max() <= MIN_END_ACCELERATION:
         return
     if not _solve_at(problem, time, near, motion[0], sliders[0]):
@@ -316,7 +421,7 @@ def _measure_jump(problem: PathProblem, edge: float, time: float, step: float, n
     for i in range(3):
         weights = problem.shares[0, i], problem.shares[1, i], problem.shares[2, i]
         _measure_rates(sliders[1], sliders[0], i, step, False, worst[0], weights)
-    _measure_tool(problem, time, motion, arms, step, False, worst)
+    _measure_tool(problem, time, motion[1], motion[0], arms, step, False, worst)
 
 
 @compiled(
@@ -372,7 +477,11 @@ def survey(
     float
         First time at which the path is out of reach [s]; NaN if it stays within reach.
     """
-    problem = PathProblem(legs, knots, pieces, in_sliders, tools, law_knots, law_pieces, box, np.empty((2, 9)), shares)
+    wider = np.empty((2, 9))
+    wider[0], wider[1] = box[0] - ROUNDING, box[1] + ROUNDING
+    problem = PathProblem(
+        legs, knots, pieces, in_sliders, tools, law_knots, law_pieces, wider, np.empty((2, 9)), shares
+    )
     times = _sample_times(knots, law_knots, law_pieces, first, until, even, step)
     worst[:] = 0.0
     near = start.copy()

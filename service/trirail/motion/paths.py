@@ -43,6 +43,8 @@ BISECTIONS = 48
 """Number of bisection steps after which an interval is narrower than the resolution of a float."""
 ROUNDING = 1e-9
 """Tolerance for rounding errors of positions and times [m, rad, s]."""
+OUTWARD_ROUNDING = 1e-12
+"""Outward motion beyond a limit that is treated as rounding [m, rad]. The last gate allows it in each cycle."""
 MAX_TIME_FALL_S = 1e-12
 """Greatest decrease of the time along a path that is treated as rounding, near the start of the path [s]."""
 RELATIVE_TIME_FALL = 4.0 * float(np.finfo(np.float64).eps)

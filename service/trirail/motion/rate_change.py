@@ -1,6 +1,6 @@
 """Changes of the rate at which time runs along a path, for pause, stop, resume and override.
 
-The loop process computes the change, and checks a limited number of knots per cycle. Braking therefore does not depend
+The loop process computes the change, and takes a limited number of samples per cycle. Braking therefore does not depend
 on any other process.
 """
 
@@ -17,10 +17,11 @@ from trirail.motion.runs import Run, arrival_time
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import CHANGE_SHARES, TimeScaling, greatest_rate
 
-MIN_KNOTS_PER_CYCLE = 8
-"""Least number of knots of a path that are sampled in one cycle."""
-KNOTS_PER_SECOND = 24_000.0
-"""Number of knots that are sampled in one cycle, per second of the cycle's period. A longer cycle has more time."""
+MIN_SAMPLES_PER_CYCLE = 40
+"""Least number of samples in and next to pieces of a path that are taken in one cycle."""
+SAMPLES_PER_SECOND = 120_000.0
+"""Number of samples in and next to pieces of a path that are taken in one cycle, per second of the cycle's period. A
+longer cycle has more time."""
 MAX_POSTPONEMENTS = 3
 """Greatest number of times that the start of a law is postponed, to leave enough cycles for sampling the whole law."""
 
@@ -60,7 +61,7 @@ class RateChange:
         self._scaling = scaling
         self._schedule = schedule
         self._period = period
-        self._knots = max(MIN_KNOTS_PER_CYCLE, int(KNOTS_PER_SECOND * period))
+        self._samples = max(MIN_SAMPLES_PER_CYCLE, int(SAMPLES_PER_SECOND * period))
         self._restart()
 
     @property
@@ -160,7 +161,7 @@ class RateChange:
         for path, first in begins:
             until = min(arrival_time(law, rate, path.duration), last)
             if first <= until:
-                sampled += [_Part(path, *each) for each in parts(path, law, first, until, self._knots)]
+                sampled += [_Part(path, *each) for each in parts(path, law, first, until, self._samples)]
         return sampled
 
     def _next_share(self) -> None:
