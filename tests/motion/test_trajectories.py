@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
@@ -11,9 +12,11 @@ from control_rig import CONFIG, ControlRig, expected_duration
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from refusals import refusal
-from trirail.motion.feasibility import Checker
+from trirail.motion.feasibility import Checker, slowdown_factor
 from trirail.motion.limits import Bounds
+from trirail.motion.path_planner import PathPlanner
 from trirail.motion.quintic import Point, quintic
+from trirail.motion.runs import rest, stretched
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
@@ -130,6 +133,72 @@ def test_whatever_its_accelerations_at_rest_the_setpoints_stay_within_the_limits
     rig.until(rig.holds, 20_000)
     assert rig.control.fault is None
     assert_within_limits(rig)
+
+
+@given(
+    st.sampled_from((0.3, 0.5, 1.0)),
+    st.floats(-1.0, 1.0),
+    st.floats(-1.0, 1.0),
+    st.integers(0, 2),
+    st.sampled_from((0.0, 0.005, 0.02)),
+)
+def test_one_with_accelerations_at_rest_is_stretched_until_it_fits(
+    seconds: float, first: float, last: float, coordinate: int, way: float
+) -> None:
+    """As little as possible: the jerk at an end is the acceleration over one cycle, and becomes less by the square."""
+    scale = 1.0 / CONFIG.limits.platform.velocity[0]
+    poses, accelerations = np.zeros((2, 3)), np.zeros((2, 3))
+    factor = CONFIG.limits.platform.velocity[coordinate] * scale
+    poses[1, coordinate], accelerations[:, coordinate] = factor * way, np.multiply(factor, (first, last))
+    points = [
+        Point(t, p, STILL, a) for t, p, a in zip((0.0, seconds), poses.tolist(), accelerations.tolist(), strict=True)
+    ]
+    bounds = Bounds(CONFIG.limits, PERIOD)
+    checker = Checker(ROBOT, CONFIG.limits, bounds, PERIOD)
+    platform, slider = CONFIG.limits.platform, CONFIG.limits.slider
+    plan = PathPlanner(ROBOT, platform, slider, bounds, checker, PERIOD).plan_trajectory(rest(STILL), points, True)
+    assert slowdown_factor(checker.worst_shares(plan.path, STILL)) <= 1.0
+    if plan.reply.slowed > 1.01:
+        quicker = stretched(plan.path, 1.0 / 1.01)
+        assert slowdown_factor(checker.worst_shares(quicker, STILL)) > 1.0
+
+
+BEFORE_A_WAIT = (
+    ((0.374, 0.25, -0.6, -6.0), (0.774, 0.225, 0.0, 0.0)),
+    ((3.965, 0.5134, -0.0198, 1.6855), (6.3015, 0.686, 0.0, 0.0)),
+)
+"""Time, angle, angular velocity and angular acceleration at points: an acceleration and a turn between the points are
+greater than at the points."""
+
+
+@settings(max_examples=40)
+@example(points=BEFORE_A_WAIT[0], wait=120.0)
+@example(points=BEFORE_A_WAIT[1], wait=200.0)
+@given(
+    st.tuples(
+        st.tuples(st.floats(0.1, 2.0), st.floats(0.0, 0.8), st.floats(-1.0, 1.0), st.floats(-4.0, 4.0)),
+        st.tuples(st.floats(2.1, 4.0), st.floats(0.0, 0.8), st.just(0.0), st.just(0.0)),
+    ),
+    st.sampled_from((0.0, 20.0, 400.0)),
+)
+def test_before_a_long_wait_the_setpoints_stay_within_the_limits(
+    points: tuple[tuple[float, float, float, float], ...], wait: float
+) -> None:
+    rig = ControlRig()
+    rig.enable()
+    rows = [(0.0, 0.0, 0.0, 0.0), *points]
+    rows += [(points[-1][0] + wait, points[-1][1], 0.0, 0.0)] if wait else []
+    goal = [
+        TrajectoryPoint(t, 0.0, 0.0, phi, velocity=(0.0, 0.0, rate), acceleration=(0.0, 0.0, change))
+        for t, phi, rate, change in rows
+    ]
+    answer = rig.send("g", TrajectoryGoal(tuple(goal), stretch=True))
+    if isinstance(answer, Accepted):
+        rig.cycles(math.ceil(points[-1][0] * answer.reply.slowed / PERIOD))
+        assert rig.control.fault is None
+        assert_within_limits(rig)
+    else:
+        assert refusal(answer).code == "out_of_workspace"
 
 
 def test_rounding_of_a_velocity_is_not_a_motion(rig: ControlRig) -> None:

@@ -36,8 +36,12 @@ MIN_LIMIT_SHARE = 0.1
 """Lowest factor on a limit in one replanning step, if a plan from a moving robot does not fit."""
 MAX_REPLANS = 3
 """Greatest number of plans from a moving robot. Each plan has lower limits than the previous plan."""
-MAX_SLOWDOWN_CHECKS = 8
+MAX_SLOWDOWN_CHECKS = 16
 """Greatest number of slowdowns of a path, each followed by a check whether the path fits."""
+SECANT_CHECKS = 2
+"""Number of checks that fail before the slowdowns are computed with the secant method."""
+MAX_SECANT_POWER = 4.0
+"""Greatest power of the factor that is left, by which a path is slowed with the secant method."""
 LIMIT_UTILISATION = 0.97
 """Fraction of a limit that a replanned path aims at. The margin prevents rounding errors from exceeding the limit."""
 MAX_JOG_PLANS = 12
@@ -352,14 +356,22 @@ class PathPlanner:
         """Slow a path by at least `factor` until it fits the limits. Return the slowed path and the final factor.
 
         One slowdown may not be enough. A peak of the jerk that is shorter than a sampling step lasts longer in the
-        slower path, and may only then be sampled.
+        slower path, and may only then be sampled. The jerk over a cycle also falls more slowly than with the third
+        power of the factor if the path has an acceleration at an end, or if the path lasts only a few cycles. The
+        secant method then finds the power of the factor with which the path must be slowed.
         """
-        for _ in range(MAX_SLOWDOWN_CHECKS):
+        factors, left = [], []
+        for check in range(MAX_SLOWDOWN_CHECKS):
             slow = stretched(path, factor)
             factor_left = slowdown_factor(self.checker.worst_shares(slow, pose))
             if factor_left <= 1.0:
                 return slow, factor
-            factor *= factor_left * ROUNDING_FACTOR
+            factors.append(factor)
+            left.append(factor_left)
+            power = 1.0
+            if check >= SECANT_CHECKS and left[-1] < left[-2]:
+                power = math.log(factors[-1] / factors[-2]) / math.log(left[-2] / left[-1])
+            factor *= (factor_left * ROUNDING_FACTOR) ** min(max(power, 1.0), MAX_SECANT_POWER)
         raise RefusedError(
             RefusalCode.TOO_FAST, f"the path exceeds its limits even when it is slowed {factor:.3g} times"
         )
