@@ -106,8 +106,8 @@ def parts(path: Path, law: Path, first: float, until: float, samples: int) -> li
     totals = np.cumsum(np.clip(numbers, MIN_SAMPLES_IN_PIECE, MAX_SAMPLES_IN_PIECE).astype(np.int64) + 1)
     times, piece = [first], 0
     while True:
-        taken = totals[piece - 1] if piece else 0
-        piece = max(piece + 1, int(np.searchsorted(totals, taken + samples, side="right")))
+        before = totals[piece - 1] if piece else 0
+        piece = max(piece + 1, int(np.searchsorted(totals, before + samples, side="right")))
         if piece >= len(totals):
             return list(pairwise([*times, until]))
         times.append(passing_time(law.knots, law.pieces, path.knots[begin + piece], until))
