@@ -64,11 +64,13 @@ class Robot:
         await self.accepts.wait()
         if self.refuses is not None:
             raise self.refuses
-        goal = AsyncGoalHandle(f"g{len(self.goals) + 1}", self._stop)
+        goal = AsyncGoalHandle(f"g{len(self.goals) + 1}", self._stop, self._answer)
         if self.goals and self.goals[-1].result is None:
             self.end("preempted", -1)
         self.goals.append(goal)
         return goal
+
+    async def _answer(self) -> None: ...
 
     async def _stop(self, *_: object) -> None:
         if self.goals[-1].result is not None:

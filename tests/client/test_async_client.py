@@ -54,7 +54,7 @@ async def nothing(*_: object) -> Any:
 
 
 TWINS = [
-    (AsyncGoalHandle("g", nothing), GoalHandle),
+    (AsyncGoalHandle("g", nothing, nothing), GoalHandle),
     (AsyncJog(nothing, (0.0, 0.0, 0.0), 1.0), Jog),
     (AsyncLease(nothing, force=False, timeout=1.0), Lease),
     (AsyncTrack(nothing, lambda *_: None, "g", 1.0), Track),

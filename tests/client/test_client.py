@@ -60,7 +60,7 @@ def noisy(tmp_path: Path) -> Iterator[Robot]:
 
 def unheard(robot: Robot) -> GoalHandle:
     """A goal of which nobody tells anything."""
-    return GoalHandle(AsyncGoalHandle("mine", robot._robot.command), robot._loop, robot.command)
+    return GoalHandle(AsyncGoalHandle("mine", robot._robot.command, robot._robot.role), robot._loop, robot.command)
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,12 @@ import asyncio
 import itertools
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
+from trirail.client import goal as goal_module
 from trirail.client.goal import AsyncGoalHandle, OpenGoals, Result
-from trirail.errors import ServiceError, WaitTimeoutError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, WaitTimeoutError
 from trirail.wire.marks import Switch
 from trirail.wire.messages import GoalReply
 
@@ -21,7 +22,7 @@ def handle(goal_id: str) -> AsyncGoalHandle:
     async def command(*_: object) -> None:
         raise AssertionError("nothing was to be commanded")
 
-    return AsyncGoalHandle(goal_id, command)
+    return AsyncGoalHandle(goal_id, command, command)
 
 
 def reply(goal_id: str) -> GoalReply:
@@ -112,3 +113,65 @@ def test_a_restarted_gateway_repeats_switches_that_the_result_has_once() -> None
     goals.end(Result("g1", "stopped", "the gateway has died: controlled stop"))
     assert goal.result is not None
     assert goal.result.marks == (switch, later)
+
+
+# ---------------------------------------------------------------------- a service that does not answer
+
+
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(goal_module, "CHECK_PERIOD_S", 0.01)
+    monkeypatch.setattr(goal_module, "SILENT_AFTER_S", 0.5)
+
+
+async def no_command(*_: object) -> None:
+    raise AssertionError("nothing was to be commanded")
+
+
+async def hangs() -> None:
+    await asyncio.Event().wait()
+
+
+@pytest.mark.usefixtures("hurried")
+@pytest.mark.parametrize("error", [ServiceError("no robot answers"), RefusedError(RefusalCode.NOT_ALLOWED, "no")])
+def test_a_wait_ends_if_the_service_is_silent_and_not_if_it_refuses(error: Exception) -> None:
+    checks: list[None] = []
+
+    async def check() -> None:
+        checks.append(None)
+        raise error
+
+    async def wait() -> None:
+        goal = AsyncGoalHandle("g1", no_command, check)
+        if isinstance(error, ServiceError):
+            with pytest.raises(ServiceError, match="the end of goal g1 is unknown: no robot answers"):
+                await goal.wait()
+        with pytest.raises(WaitTimeoutError):
+            await goal.wait(0.3 if isinstance(error, ServiceError) else 0.8)
+        assert len(checks) > 1
+        goal.end(Result("g1", "done", ""))
+        assert (await goal.wait()).outcome == "done"
+
+    asyncio.run(wait())
+
+
+@pytest.mark.usefixtures("hurried")
+@given(st.lists(st.booleans(), max_size=12))
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_wait_goes_on_while_the_service_answers_now_and_then(answers: list[bool]) -> None:
+    async def wait() -> Result:
+        left = iter(answers)
+
+        async def check() -> None:
+            if (answer := next(left, None)) is None:
+                goal.end(Result("g1", "done", ""))
+                await hangs()
+            if not answer:
+                raise ServiceError("no robot answers")
+
+        goal = AsyncGoalHandle("g1", no_command, check)
+        return await goal.wait()
+
+    silent_s = 0.01 * max((len(list(run)) for answer, run in itertools.groupby(answers) if not answer), default=0)
+    assume(silent_s < 0.1)  # far from the limit, however busy the machine is
+    assert asyncio.run(wait()).outcome == "done"

@@ -31,7 +31,7 @@ class Sent:
             finish(self.track.update(POSE))
 
     async def _begin(self, _: object, goal_id: str) -> AsyncGoalHandle:
-        handle = AsyncGoalHandle(goal_id, no_command)
+        handle = AsyncGoalHandle(goal_id, no_command, no_command)
         handle.reply = GoalReply(goal_id, None, lag=0.0)
         return handle
 

@@ -208,7 +208,7 @@ class FakeRobot:
         return NamedPose(name, *self.named.pop(name), taught=True)
 
     def _handle(self, goal_id: str) -> GoalHandle:
-        goal = self._handles.setdefault(goal_id, AsyncGoalHandle(goal_id, no_command))
+        goal = self._handles.setdefault(goal_id, AsyncGoalHandle(goal_id, no_command, no_command))
         return GoalHandle(goal, loop(), lambda *_: None)
 
     def command(self, name: str, content: bytes | None = None) -> CommandReply:

@@ -363,7 +363,7 @@ class AsyncRobot:
         """
         goal_id = id or id_of(make)
         *before, last = goal_messages(make, goal_id)
-        goal = self._goals.open(AsyncGoalHandle(goal_id, self.command))
+        goal = self._goals.open(AsyncGoalHandle(goal_id, self.command, self.role))
         try:
             reply = await self._connection.fetch(("goal", self.user), GoalReply, last, before=before)
         except BaseException as error:

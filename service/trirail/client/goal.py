@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 import uuid
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable
@@ -23,6 +24,10 @@ STANDS_WITHIN = 10.0
 """Longest time from the time-out of a jog to the robot's rest [s]."""
 BRAKE_RENEWAL_S = 0.05
 """Time-out of the last renewal of a jog, which sets the velocity to zero [s]."""
+CHECK_PERIOD_S = 2.0
+"""Period at which a wait for the end of a goal checks that the service answers [s]."""
+SILENT_AFTER_S = 15.0
+"""Time without an answer after which such a wait ends [s]; a lost connection is often restored within this time."""
 
 Velocity = tuple[float, float, float]
 """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
@@ -59,14 +64,21 @@ def result_of(event: Event) -> Result | None:
 class AsyncGoalHandle:
     """Handle of an accepted goal; discarding the handle does not stop the goal.
 
-    `command` is a function that sends a command with its content, such as AsyncRobot.command.
+    `command` is a function that sends a command with its content, such as AsyncRobot.command. `check` is a function
+    that raises ServiceError if the service does not answer.
     """
 
-    def __init__(self, goal_id: str, command: Callable[[Command, bytes], Awaitable[object]]) -> None:
+    def __init__(
+        self,
+        goal_id: str,
+        command: Callable[[Command, bytes], Awaitable[object]],
+        check: Callable[[], Awaitable[object]],
+    ) -> None:
         self.id = goal_id
         self.reply = GoalReply(goal_id, 0.0)
         """Reply of the service that accepted the goal."""
         self._command = command
+        self._check = check
         self._result: Result | None = None
         self._lost = ""
         """Reason why the result will remain unknown."""
@@ -105,17 +117,38 @@ class AsyncGoalHandle:
         """Wait until the goal ends; return its result. The `outcome` of the result is "done" if the goal succeeded.
 
         Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues. Raises ServiceError
-        if the client is closed before the goal ends, or if the service has started again, so that its end is unknown.
+        if the end of the goal is unknown, because the client is closed before the goal ends, the service does not
+        answer for SILENT_AFTER_S, or the service has started again. After a silence, you may wait again.
         """
         within = seconds(timeout)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(within):
-                await self._ended.wait()
+        ended, silent = asyncio.create_task(self._ended.wait()), asyncio.create_task(self._wait_for_silence())
+        try:
+            await asyncio.wait((ended, silent), timeout=within, return_when=asyncio.FIRST_COMPLETED)
+            if silent.done() and not self._ended.is_set():
+                raise ServiceError(f"the end of goal {self.id} is unknown: {silent.result()}")
+        finally:
+            ended.cancel()
+            silent.cancel()
         if self._result is None and self._ended.is_set():
             raise ServiceError(self._lost)
         if self._result is None:
             raise WaitTimeoutError(f"goal {self.id} has not ended within {within:g} s")
         return self._result
+
+    async def _wait_for_silence(self) -> ServiceError:
+        """Return the error of the check once the service has not answered for SILENT_AFTER_S."""
+        answered = time.monotonic()
+        while True:
+            await asyncio.sleep(CHECK_PERIOD_S)
+            try:
+                await self._check()
+            except ServiceError as error:
+                if time.monotonic() - answered > SILENT_AFTER_S:
+                    return error
+                continue
+            except RefusedError:
+                pass  # a refusal is an answer, too
+            answered = time.monotonic()
 
     def end(self, result: Result | None, reason: str = CLOSED) -> None:
         """Set the result, which is None if it remains unknown for a `reason`, and wake the tasks that wait for it."""
