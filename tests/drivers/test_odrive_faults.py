@@ -391,6 +391,40 @@ def test_a_drive_that_keeps_its_power_stays_at_the_end_of_the_ramp_and_is_named(
     rig.assert_no_jump()
 
 
+@pytest.mark.parametrize("mode", ["holding"])
+@pytest.mark.parametrize(
+    ("state", "lost"), [*((state, 0) for state in (*cansimple.PROCEDURES, 5)), (9, 1), (11, 3)]
+)
+def test_a_procedure_that_a_drive_begins_by_itself_stops_the_robot_and_is_ended(
+    rig: OdriveRig, state: int, lost: int, mode: str
+) -> None:
+    """Without power before, the idle state that is wanted has been requested long ago."""
+    rig.cycles(50)
+    rig.inject(f"B drop set_axis_state for {lost} frames" if lost else "error-passive")
+    rig.odrives[1].axis_state = state
+    rig.until(rig.faulty, BEAT)
+    assert rig.control.fault == f"drive B: runs {cansimple.state_name(state)}, which the service did not request"
+    assert rig.control.measured.powered
+    rig.until(lambda: rig.odrives[1].axis_state == AxisState.IDLE, (2 + 2 * lost) * BEAT)
+    rig.cycles(2 * BEAT)
+    assert isinstance(rig.command("reset"), CommandDone)
+    rig.enable()
+
+
+@pytest.mark.parametrize("mode", ["holding"])
+@pytest.mark.parametrize("command", ["disable", "quick_stop", "reset"])
+def test_a_drive_that_does_not_end_its_procedure_is_named_and_commands_are_answered(
+    rig: OdriveRig, command: str, mode: str
+) -> None:
+    rig.cycles(50)
+    rig.odrives[1]._handlers[cansimple.SET_AXIS_STATE] = lambda data: None
+    rig.odrives[1].axis_state = 9
+    rig.cycles(1500)
+    answer = rig.command(command)
+    assert isinstance(answer, Refused)
+    assert "drive B" in answer.message
+
+
 @pytest.mark.parametrize("mode", [*map(tried, NOT_HOMING)])
 def test_drives_whose_service_is_gone_are_disarmed_by_their_watchdogs(rig: OdriveRig, mode: str) -> None:
     begin(rig, mode, "error-passive")

@@ -134,12 +134,12 @@ class OdriveAxis(Axis):
         self._update_errors(errors, self.state)
         if not cansimple.is_starting(self.state, errors):
             self._started = True
-        if self.state == AxisState.CLOSED_LOOP_CONTROL:
-            if self.requested is AxisState.CLOSED_LOOP_CONTROL:
-                self.powered_up = True
-            elif self.state_is_current:
-                self.requested = None  # the drive still has power: request idle again
-        elif self.requested is AxisState.CLOSED_LOOP_CONTROL and self.state_is_current and not self.powered_up:
+        if self.requested is not AxisState.CLOSED_LOOP_CONTROL:
+            if self.powered and self.state_is_current:
+                self.requested = None  # the drive has power that the service does not want: request idle again
+        elif self.state == AxisState.CLOSED_LOOP_CONTROL:
+            self.powered_up = True
+        elif self.state_is_current and not self.powered_up:
             self._watch_refusal()
 
     def note_request(self, state: AxisState) -> None:
@@ -164,12 +164,12 @@ class OdriveAxis(Axis):
                 return PowerState.NOT_READY_TO_SWITCH_ON
             case AxisState.IDLE:
                 return PowerState.FAULT if self.errors else PowerState.SWITCH_ON_DISABLED
-            case AxisState.CLOSED_LOOP_CONTROL if self.errors:
+            case _ if self.errors:
                 return PowerState.FAULT_REACTION_ACTIVE
-            case AxisState.CLOSED_LOOP_CONTROL:
-                return PowerState.OPERATION_ENABLED if follows else PowerState.QUICK_STOP_ACTIVE
-            case _:
-                return PowerState.SWITCHED_ON
+            case AxisState.CLOSED_LOOP_CONTROL if follows:
+                return PowerState.OPERATION_ENABLED
+            case _:  # in a procedure, too, the drive moves its motor without setpoints
+                return PowerState.QUICK_STOP_ACTIVE
 
     @property
     def powered(self) -> bool:
@@ -184,7 +184,7 @@ class OdriveAxis(Axis):
             return self.make_fault("fault", self.errors, f"error {describe_errors(self.errors)}")
         if silent := self.silence_fault(now):
             return silent
-        if self.state in cansimple.PROCEDURES:
+        if self.powered and self.state != AxisState.CLOSED_LOOP_CONTROL:
             text = f"runs {cansimple.state_name(self.state)}, which the service did not request"
             return self.make_fault("state", 0, text)
         if follows and self.powered_up and self.state != AxisState.CLOSED_LOOP_CONTROL:
