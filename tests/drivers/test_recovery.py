@@ -15,6 +15,7 @@ from control_rig import CONFIG
 from drivers.test_homing import incremental
 from drivers.test_odrive import odrives
 from trirail.config import Config
+from trirail.control.feedback import CAN_MOVE
 from trirail.errors import RefusalCode
 from trirail.wire.packets import CommandDone, Refused, Request
 from trirail.wire.vocabulary import Mode
@@ -93,7 +94,7 @@ class RecoveryRig(Rig):
         assert self.mode is Mode.HOLDING
 
     def assert_unpowered(self) -> None:
-        assert not any(drive.power is PowerState.OPERATION_ENABLED for drive in self.bus.drives)
+        assert not any(drive.power in CAN_MOVE for drive in self.bus.drives)
 
     def said(self, words: str) -> list[str]:
         return [notice.message for notice in self.notices if words in notice.message]
@@ -129,6 +130,20 @@ def rig(config: Config) -> Iterator[RecoveryRig]:
 
 either = pytest.mark.parametrize("config", [REAL, ODRIVES], ids=["cia402", "odrive"])
 """The same over both protocols."""
+
+
+def test_no_drive_is_configured_while_another_still_brakes_because_of_its_fault(rig: RecoveryRig) -> None:
+    moving(rig)
+    braking = rig.drives[1]
+    braking.objects[0x6085, 0].value = round(braking.objects[0x6085, 0].value * 0.05)  # a long ramp
+    braking.fail(0x2310)
+    rig.cycles(2)
+    rig.bus.faults.add("A reboot")
+    rig.cycles(200)
+    assert braking.state is PowerState.FAULT_REACTION_ACTIVE
+    assert not rig.asked
+    rig.until(rig.ready, ENDS)
+    assert rig.asked
 
 
 @either

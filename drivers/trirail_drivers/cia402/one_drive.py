@@ -30,9 +30,13 @@ from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
 
-HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
+HAS_POWER = (
+    PowerState.SWITCHED_ON,
+    PowerState.OPERATION_ENABLED,
+    PowerState.QUICK_STOP_ACTIVE,
+    PowerState.FAULT_REACTION_ACTIVE,
+)
 """States in which current may flow in a drive's motor."""
-_POWERED = (*HAS_POWER, PowerState.FAULT_REACTION_ACTIVE)
 
 BOOT_TIMEOUTS: Final = 10
 """Longest boot time of a drive, as a multiple of `sdo_timeout`."""
@@ -214,10 +218,10 @@ async def _switch_off(remote: Remote, seconds: float) -> None:
     """Remove a drive's power, and wait until its state shows that, since a brake needs time to close."""
     await remote.write(0x6040, 0, canopen_frames.DISABLE_VOLTAGE)
     statusword, waited = await remote.wait_until(
-        (0x6041, 0), lambda statusword: canopen_frames.power_state(statusword) not in _POWERED, seconds
+        (0x6041, 0), lambda statusword: canopen_frames.power_state(statusword) not in HAS_POWER, seconds
     )
     statusword = await remote.read(0x6041) if statusword is None else statusword
-    if not remote.rehearsed and canopen_frames.power_state(statusword) in _POWERED:
+    if not remote.rehearsed and canopen_frames.power_state(statusword) in HAS_POWER:
         raise DriveError(f"drive {remote.name}: did not power off within {waited:.3g} s (statusword {statusword:04X})")
 
 
