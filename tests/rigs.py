@@ -216,6 +216,10 @@ class DriverRig(Cycles[AnyDriver], ABC, Generic[AnyDevice, AnyDriver]):
     def keep_power(self, index: int) -> None:
         """Let a drive not obey what would take its power."""
 
+    @abstractmethod
+    def get_power(self, index: int) -> None:
+        """Give a drive power without a command."""
+
     def enable(self) -> Feedback:
         self.drives.enable()
         for _ in range(self.enabled_within):

@@ -123,6 +123,21 @@ def test_a_drive_that_keeps_its_power_is_named_with_its_state(enabled: AnyRig, a
     assert enabled.found("timeout", within=3) == ("B", "timeout", 0, said)
 
 
+@pytest.mark.parametrize("before", ["set-up", "disable"])
+def test_a_drive_that_gets_power_by_itself_is_named_with_its_state(ready: AnyRig, before: str) -> None:
+    if before == "disable":
+        ready.enable()
+        ready.drives.disable()
+    ready.cycles(1500)
+    ready.keep_power(1)
+    ready.get_power(1)
+    said = f"drive B: {ready.keeps_power.format('it got power by itself')}"
+    assert ready.found("timeout", within=1150) == ("B", "timeout", 0, said)
+    again = ready.cycles(2500).fault
+    assert again is not None
+    assert again.message == said
+
+
 def test_nothing_is_enabled_while_a_fault_is_latched(enabled: AnyRig) -> None:
     enabled.bus.faults.add("A fault 200")
     assert enabled.cycles(240).fault is not None

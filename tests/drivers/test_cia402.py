@@ -75,6 +75,9 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
     def keep_power(self, index: int) -> None:
         self.devices[index].objects.on_write(0x6040, lambda entry, old: None)
 
+    def get_power(self, index: int) -> None:
+        self.devices[index].state = P.OPERATION_ENABLED
+
 
 @pytest.fixture
 def new() -> Iterator[Rig]:

@@ -381,6 +381,27 @@ def test_the_pose_is_found_again_after_sliders_that_belong_to_none(rig: Cia402Ri
     assert rig.control.measured.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
+@pytest.mark.parametrize("command", ["disable", "quick_stop"])
+@pytest.mark.parametrize("before", ["disable", "quick_stop"])
+def test_a_drive_under_local_control_that_has_power_is_named_and_commands_are_answered(
+    rig: Cia402Rig, before: str, command: str
+) -> None:
+    holding(rig)
+    rig.command(before)
+    rig.cycles(1200)
+    drive = rig.drives[1]
+    drive.objects.on_write(0x6040, lambda entry, old: None)
+    drive.state = PowerState.OPERATION_ENABLED
+    rig.cycles(1300)
+    assert rig.mode is Mode.FAULT
+    fault = rig.control.measured.feedback.fault
+    assert fault is not None
+    assert fault.message.startswith("drive B: is operation enabled 1 s after it got power by itself")
+    answer = rig.command(command)
+    assert isinstance(answer, Refused)
+    assert fault.message in answer.message
+
+
 def test_a_drive_that_does_not_leave_its_fault_is_not_reset(rig: Cia402Rig) -> None:
     holding(rig)
     rig.drives[1].fail(0x2310)

@@ -68,6 +68,9 @@ class Rig(DriverRig[SimulatedOdrive, Odrive]):
     def keep_power(self, index: int) -> None:
         self.devices[index]._handlers[cansimple.SET_AXIS_STATE] = lambda data: None
 
+    def get_power(self, index: int) -> None:
+        self.devices[index].axis_state = AxisState.CLOSED_LOOP_CONTROL
+
     def commands(self) -> list[list[tuple[int, int]]]:
         """What each drive was told: number and first byte of each command, without setpoints and requests."""
         sent = [(divmod(can_id, 32), data) for can_id, data in self.bus.sent]
@@ -336,7 +339,7 @@ class TestFaults:
             cansimple.identifier(7, cansimple.HEARTBEAT), cansimple.BEAT.pack(0, 4, ProcedureResult.BUSY, 0)
         )
         assert "motor calibration" in ready.found("state", within=1).message
-        assert ready.drives.read().state[1] is P.SWITCHED_ON
+        assert ready.drives.read().state[1] is P.QUICK_STOP_ACTIVE
 
     @pytest.mark.parametrize("command", COMMANDS_OF_MASTERS)
     def test_somebody_else_commands_a_drive(self, enabled: Rig, command: int) -> None:

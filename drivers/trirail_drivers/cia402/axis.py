@@ -441,6 +441,8 @@ class Cia402Axis(Axis):
         if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
             return None
         text = f"is {self.state} {seconds:g} s after {wanted}; expected switch on disabled"
+        if not self.statusword & canopen_frames.REMOTE:
+            text += f"; it may be under local control: bit 9 (remote) of statusword {self.statusword:04X} is clear"
         return self.make_fault("timeout", 0, text)
 
     def find_fault(self, now: float, wanted: canopen_frames.TargetState) -> DriveFault | None:

@@ -91,6 +91,8 @@ POLL_PERIOD: Final = 0.02
 """Period of the SDO requests for a statusword that the drive does not repeat in a PDO [s]."""
 INTERPOLATE: Final = 0x10
 """Controlword bit 4, which enables interpolated position mode; sent together with ENABLE_OPERATION."""
+REMOTE: Final = 1 << 9
+"""Statusword bit that shows that a drive follows the controlword."""
 FOLLOWS_SETPOINTS: Final = 1 << 12
 """Statusword bit that shows that a drive follows setpoints, in modes 8 and 7."""
 

@@ -269,7 +269,11 @@ class Driver(ABC, Generic[AnyAxis]):
         self._off_deadline, self._stop_reason = self._clock() + self._drives.stop_timeout, reason
 
     def _check_stopped(self, now: float) -> None:
-        """Latch a fault for the first drive that still has power after `stop_timeout`; only its brake can stop it."""
+        """Latch a fault for the first drive that has power `stop_timeout` after it should have none. Only its brake can
+        stop it. The time also runs for a drive that has got power without a command.
+        """
+        if self._off_deadline == math.inf and self._powered() and not self._wants_power() and not self._power_reported:
+            self._start_stop_timer("it got power by itself")
         if now < self._off_deadline:
             return
         self._off_deadline = math.inf
@@ -279,6 +283,11 @@ class Driver(ABC, Generic[AnyAxis]):
             if fault is not None:
                 self._wire.fault = fault
                 return
+
+    @property
+    def _power_reported(self) -> bool:
+        """Whether the latched fault is that of a drive that has power although it should have none."""
+        return self._wire.fault is not None and self._wire.fault.cause == "timeout"
 
     def _refuse_setpoint(self, axis: Axis, position: float, velocity: float) -> None:
         """Latch a fault for a setpoint [m], [m/s] that does not fit into a frame."""
