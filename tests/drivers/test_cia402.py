@@ -404,6 +404,32 @@ class TestFaults:
         for device in ready.devices:
             device.silent = False
 
+    @pytest.mark.parametrize("has_code", [True, False])
+    @pytest.mark.parametrize("code", [0x2310, 0x3220, 0x4310, 0x7380, 0xFF01])
+    def test_an_error_from_before_the_set_up_is_reported_until_it_ends(
+        self, new: Rig, code: int, has_code: bool
+    ) -> None:
+        """Without a fault state: by the error register, and by the error code if the drive has one."""
+        device = new.devices[1]
+        device.errors.report(code)
+        shown = code if has_code else 0x1000
+        device.objects[0x603F, 0].value = code if has_code else 0
+        new.drives.configure(PERIOD)
+        fault = new.found("emcy", within=1)
+        assert fault[:3] == ("B", "emcy", shown)
+        assert "is still in force" in fault.message
+        new.drives.reset()
+        new.cycles(490)
+        assert new.found("emcy", within=20) == fault
+        device.errors.clear(code)
+        new.drives.reset()
+        assert new.cycles(1000).fault is None
+
+    def test_a_communication_error_from_before_the_set_up_ends_with_it(self, new: Rig) -> None:
+        new.devices[1].errors.report(0x8130)
+        new.drives.configure(PERIOD)
+        assert new.cycle().fault is None
+
     def test_emergency_in_force_is_no_matter_of_the_past(self, ready: Rig) -> None:
         ready.devices[1].errors.report(0x4210)
         ready.found("emcy", within=1)

@@ -146,6 +146,26 @@ def test_no_drive_is_configured_while_another_still_brakes_because_of_its_fault(
     assert rig.asked
 
 
+@pytest.mark.parametrize("after", [0, 60, 150])
+def test_an_error_that_begins_during_the_set_up_of_a_returning_drive_is_reported_until_it_ends(
+    rig: RecoveryRig, after: int
+) -> None:
+    holding(rig)
+    rig.bus.faults.add("A reboot")
+    rig.cycles(2)
+    rig.until(lambda: bool(rig.asked))
+    rig.cycles(after)
+    assert rig.control.measured.unready
+    rig.bus.faults.add("A emcy 7380 for 3")
+    rig.until(rig.ready, ENDS)
+    rig.command("reset")
+    rig.cycles(600)
+    assert rig.mode is Mode.FAULT
+    assert "drive A: emergency 0x7380" in (rig.control.fault or "")
+    rig.cycles(3000)
+    rig.recover()
+
+
 @either
 def test_reset_is_refused_with_drive_and_progress(rig: RecoveryRig) -> None:
     counted, work, number, asked = {

@@ -142,8 +142,8 @@ class Cia402(Driver[Cia402Axis]):
         self._listen(axis)
         axis.update_position(start.counts)
         axis.inputs = start.inputs & axis.io.inputs
-        axis.error_code = start.error_code
         axis.update_status(start.statusword, axis.status_heard)
+        axis.start_error(start.error_code, in_error=start.in_error)
 
     def _prepare_frames(self) -> None:
         """Create the frames that each cycle sends."""

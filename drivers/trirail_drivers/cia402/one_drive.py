@@ -84,9 +84,15 @@ class Start(NamedTuple):
     statusword: int
     """Statusword 6041h."""
     error_code: int
-    """Error code 603Fh if the drive is in fault, otherwise 0."""
+    """Error code 603Fh if the drive has an error, otherwise 0."""
+    in_error: bool = False
+    """Whether the error register 1001h shows an error."""
     inputs: int = 0
     """Digital inputs 60FDh if the robot uses inputs of the drive, otherwise 0."""
+
+
+_COMMUNICATION_ERROR: Final = (0x10, 0x11)
+"""Error registers 1001h that show only a communication error. Without a fault, it ends when the cycle begins."""
 
 
 class SetupTask(NamedTuple):
@@ -229,11 +235,18 @@ async def read_start(remote: Remote, io: DigitalIo) -> Start:
     """Read the present state of a drive."""
     statusword = await remote.read(0x6041)
     in_fault = canopen_frames.power_state(statusword) in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
-    error_code = 0
-    if in_fault and await remote.has(0x603F):
-        try:
-            error_code = await remote.read(0x603F)
-        except SdoRefused:
-            error_code = 0
+    register = await _read_error(remote, 0x1001)
+    in_error = register != 0 and register not in _COMMUNICATION_ERROR
+    error_code = await _read_error(remote, 0x603F) if in_fault or in_error else 0
     inputs = await remote.read(0x60FD) if io.inputs else 0
-    return Start(await remote.read(0x6064), statusword, error_code, inputs)
+    return Start(await remote.read(0x6064), statusword, error_code, in_error, inputs)
+
+
+async def _read_error(remote: Remote, index: int) -> int:
+    """Return the present value of an object about errors, or 0 if the drive lacks the object or refuses to read it."""
+    if not await remote.has(index):
+        return 0
+    try:
+        return await remote.read(index)
+    except SdoRefused:
+        return 0
