@@ -333,12 +333,22 @@ def test_settings_that_read_back_different_are_named_and_the_service_stays() -> 
     rig.bus.shutdown()
 
 
-def test_an_odrive_whose_position_is_relative_is_not_homed() -> None:
+def relative(drive: SimulatedOdrive) -> None:
+    drive.version = Version((5, 2, 0), (0, 6, 8))  # tells it
+    drive.settings[POSITION_STATUS] = RELATIVE_MODE
+
+
+def test_an_odrive_whose_position_is_relative_is_not_homed_after_a_restart() -> None:
+    """Its position at the first set-up counts, whenever it appears."""
     rig = AbsentRig((0,), ODRIVES)
     drive = rig.bus.drives[0]
     assert isinstance(drive, SimulatedOdrive)
-    drive.version = Version((5, 2, 0), (0, 6, 8))  # tells it
-    drive.settings[POSITION_STATUS] = RELATIVE_MODE
+    relative(drive)
+    rig.supply(0)
+    rig.recover()
+    assert rig.said("drive A: axis0.pos_vel_mapper.status is 9, relative")
+    rig.cut(0)
+    rig.cycles(300)
     rig.supply(0)
     rig.until(rig.ready, ENDS)
     assert isinstance(rig.command("reset"), CommandDone)
@@ -346,8 +356,28 @@ def test_an_odrive_whose_position_is_relative_is_not_homed() -> None:
     answer = rig.goal("g", 0.01, 0.0, 0.0)
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
-    assert rig.said("drive A: axis0.pos_vel_mapper.status is 9, relative")
     assert rig.said("slider A: the position is unknown because the drive was off")
+    answer = rig.command("home")
+    assert isinstance(answer, Refused)
+    assert answer.message.endswith("to accept the positions as they are, restart the service")
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("seconds", [0.2, 0.4, 2.0])
+def test_an_odrive_whose_position_is_relative_keeps_it_through_silence(seconds: float) -> None:
+    rig = AbsentRig((0,), ODRIVES)
+    drive = rig.bus.drives[0]
+    assert isinstance(drive, SimulatedOdrive)
+    relative(drive)
+    rig.supply(0)
+    rig.recover()
+    rig.command("disable")
+    rig.bus.faults.add(f"A silent for {seconds}")
+    rig.cycles(200)
+    rig.until(rig.ready, ENDS)
+    assert isinstance(rig.command("reset"), CommandDone)
+    assert rig.control.measured.homed
+    rig.enable()
     rig.bus.shutdown()
 
 

@@ -25,6 +25,8 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         super().__init__(axis)
         self.one = one
         self._configured = configured
+        self._boots = 0
+        """Number of restarts up to the last set-up."""
 
     def start_setup(
         self, sender: FrameSender, clock: Clock
@@ -35,9 +37,13 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         return configure_one(one._replace(client=client), self._check), client
 
     def accept(self, made: OdriveSetup, begun: OdriveStart) -> str:
-        """Let the drive take part in the cycle. A drive with a relative position counts as not homed."""
+        """Let the drive take part in the cycle. A drive whose position is relative counts as not homed if it has
+        restarted since its first set-up, which accepts the position as it is.
+        """
+        axis = self.axis
+        restarted, self._boots = axis.boots != self._boots, axis.boots
         self._configured(begun)
-        self.axis.homed = not made.relative
+        axis.homed = self.setup is None or not made.relative or (axis.homed and not restarted)
         return ""
 
     def may_have_power(self, *, stopping: bool) -> bool:
