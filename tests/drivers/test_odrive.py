@@ -22,7 +22,7 @@ from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.codes import describe_errors
-from trirail_drivers.odrive.drives import Odrive
+from trirail_drivers.odrive.drives import MODES_SENT, Odrive
 from trirail_drivers.odrive.flat_endpoints import Version
 from trirail_drivers.odrive.other_masters import check_exclusive
 from trirail_drivers.odrive.setpoints import SETTLE_TIME_S
@@ -107,6 +107,8 @@ COMMANDS_OF_MASTERS = [
     cansimple.SET_CONTROLLER_MODE,
     cansimple.SET_INPUT_POS,
     cansimple.CLEAR_ERRORS,
+    cansimple.ESTOP,
+    *(0x0D, 0x0E, 0x0F, 0x11, 0x12, 0x13, 0x16, 0x19, 0x1A, 0x1B, 0x1F),
 ]
 
 
@@ -195,7 +197,7 @@ class TestPower:
             cansimple.SET_CONTROLLER_MODE
         )
         ready.cycles(300)
-        assert ready.commands() == [[MODE, CLOSED_LOOP]] * 3
+        assert ready.commands() == [[MODE] * MODES_SENT + [CLOSED_LOOP]] * 3
         assert [device.modes for device in ready.devices] == [(cansimple.POSITION_CONTROL, cansimple.PASSTHROUGH)] * 3
 
     def test_no_power_without_a_setpoint(self, ready: Rig) -> None:
@@ -378,7 +380,7 @@ class TestFaults:
             send(message, timeout)
 
         monkeypatch.setattr(ready.bus, "send", fail_once)
-        ready.found("bus", within=1)
+        ready.found("bus", within=MODES_SENT + 1)
         ready.cycles(100)
         assert CLOSED_LOOP not in [command for each in ready.commands() for command in each]
 
@@ -464,7 +466,7 @@ class TestReset:
         enabled.drives.reset()
         feedback = enabled.cycles(300)
         assert (feedback.state, feedback.fault) == (OFF, None)
-        assert enabled.commands() == [[], [], [(cansimple.CLEAR_ERRORS, 0)]]
+        assert enabled.commands() == [[], [], [(cansimple.CLEAR_ERRORS, 0)] * 2]
         enabled.enable()
 
     def test_while_the_cause_lasts_the_fault_comes_back(self, ready: Rig) -> None:

@@ -32,7 +32,8 @@ _NMT_STOP: Final = 0x02
 class OtherMasters:
     """Detection of other masters on the bus by frames that only this service may send.
 
-    These frames are NMT commands, SYNC, PDOs to the drives, and heartbeats with this service's node id.
+    These frames are NMT commands, SYNC, SDO requests and PDOs to the drives, and heartbeats with this service's node
+    id. The bus does not return the frames that this service sends.
     """
 
     def __init__(self, wire: Wire, axes: Sequence[Cia402Axis], master_node: int) -> None:
@@ -43,6 +44,8 @@ class OtherMasters:
         wire.listen(canopen_frames.SYNC, self, self._sends("sends SYNC"))
         wire.listen(canopen_frames.HEARTBEAT + master_node, self, self._on_heartbeat)
         for axis in axes:
+            by_sdo = self._sends(f"accesses drive {axis.name} by SDO")
+            wire.listen(canopen_frames.SDO_REQUEST + axis.node, self, by_sdo)
             self.listen_to(axis)
 
     def listen_to(self, axis: Cia402Axis) -> None:

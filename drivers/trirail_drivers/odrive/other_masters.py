@@ -18,12 +18,27 @@ from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.axis import OdriveAxis
 
 _COMMANDS: Final = {
+    cansimple.ESTOP: "sends Estop",
     cansimple.RX_SDO: "writes or reads parameters",
     cansimple.SET_AXIS_STATE: "commands axis states",
     cansimple.SET_CONTROLLER_MODE: "sets controller modes",
     cansimple.SET_INPUT_POS: "sends setpoints",
     cansimple.CLEAR_ERRORS: "clears errors",
+    # Set_Input_Vel to Set_Limits, Set_Traj_Vel_Limit to Set_Traj_Inertia, Reboot, Set_Absolute_Position to
+    # Set_Vel_Gains, and Enter_DFU_Mode, which this service never sends.
+    0x0D: "sends velocities",
+    0x0E: "sends torques",
+    0x0F: "sets limits",
+    0x11: "sets trajectory limits",
+    0x12: "sets trajectory limits",
+    0x13: "sets the inertia",
+    0x16: "restarts drives",
+    0x19: "sets positions",
+    0x1A: "sets gains",
+    0x1B: "sets gains",
+    0x1F: "updates firmware",
 }
+"""Messages to a drive that are no requests, by their commands."""
 _REQUESTS: Final = (cansimple.GET_ENCODER_ESTIMATES, cansimple.GET_ERROR)
 """Messages that a service requests in its cycles by remote frames."""
 
