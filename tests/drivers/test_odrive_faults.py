@@ -392,9 +392,7 @@ def test_a_drive_that_keeps_its_power_stays_at_the_end_of_the_ramp_and_is_named(
 
 
 @pytest.mark.parametrize("mode", ["holding"])
-@pytest.mark.parametrize(
-    ("state", "lost"), [*((state, 0) for state in (*cansimple.PROCEDURES, 5)), (9, 1), (11, 3)]
-)
+@pytest.mark.parametrize(("state", "lost"), [*((state, 0) for state in (*cansimple.PROCEDURES, 5)), (9, 1), (11, 3)])
 def test_a_procedure_that_a_drive_begins_by_itself_stops_the_robot_and_is_ended(
     rig: OdriveRig, state: int, lost: int, mode: str
 ) -> None:
@@ -423,6 +421,26 @@ def test_a_drive_that_does_not_end_its_procedure_is_named_and_commands_are_answe
     answer = rig.command(command)
     assert isinstance(answer, Refused)
     assert "drive B" in answer.message
+
+
+@pytest.mark.parametrize("mode", ["holding"])
+@pytest.mark.parametrize("lost", [1, 2])
+def test_lost_controller_modes_do_not_enable_a_drive_in_another_mode(rig: OdriveRig, lost: int, mode: str) -> None:
+    rig.inject(f"B drop set_controller_mode for {lost} frames")
+    rig.enable()
+    assert {drive.modes for drive in rig.odrives} == {(cansimple.POSITION_CONTROL, cansimple.PASSTHROUGH)}
+
+
+@pytest.mark.parametrize("mode", ["holding"])
+@pytest.mark.parametrize("lost", [1, 2])
+def test_a_reset_succeeds_although_commands_are_lost(rig: OdriveRig, lost: int, mode: str) -> None:
+    begin(rig, mode, "B fault 200 for 0.1")
+    rig.until(rig.stands, 2 * ROLLING)
+    rig.cycles(ROLLING)
+    rig.inject(f"B drop clear_errors for {lost} frames")
+    assert isinstance(rig.command("reset"), CommandDone)
+    rig.cycles(ROLLING)
+    rig.enable()
 
 
 @pytest.mark.parametrize("mode", [*map(tried, NOT_HOMING)])

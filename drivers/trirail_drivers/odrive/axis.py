@@ -43,6 +43,8 @@ class OdriveAxis(Axis):
         """Whether the drive has answered a Get_Error request."""
         self.requested: AxisState | None = None
         """Axis state requested last; None makes the driver request the target state again."""
+        self.modes_sent = 0
+        """Number of controller modes sent since the drive was enabled."""
         self.reset_until = -math.inf
         """Time until which cleared errors may persist [s]."""
         self._beats = 0

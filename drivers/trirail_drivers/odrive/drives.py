@@ -39,6 +39,11 @@ from trirail_drivers.odrive.setpoints import SetpointSender
 from trirail_drivers.odrive.setup import OdriveStart
 from trirail_drivers.timing import BusTiming
 
+MODES_SENT = 3
+"""Number of cycles in which each power-up sends the controller mode. The drive may have restarted, does not report its
+mode, and must not get power in another one if a message is lost.
+"""
+
 
 class Odrive(Driver[OdriveAxis]):
     """Three ODrives on one CAN bus.
@@ -147,6 +152,9 @@ class Odrive(Driver[OdriveAxis]):
             count_sync(axis)
         if now >= errors_due:
             self._errors_due = now + cansimple.ERROR_PERIOD
+            axis = self._axes[self._next_request]
+            if now < axis.reset_until:  # sent again, since a command may be lost
+                self._clear_errors(axis)
             self._wire.send(self._error_requests[self._next_request])
             self._next_request = (self._next_request + 1) % len(self._error_requests)
 
@@ -237,7 +245,7 @@ class Odrive(Driver[OdriveAxis]):
         for axis in self._axes:
             axis.powered_up = False
             axis.left_out = alone not in (None, axis.name)
-            axis.requested = None
+            axis.requested, axis.modes_sent = None, 0
 
     def home(self) -> None:
         """Do nothing, since the configuration refuses homing for ODrives."""
@@ -285,7 +293,10 @@ class Odrive(Driver[OdriveAxis]):
                 continue
             axis.clear_faults(now)
             if axis.errors:
-                self._wire.send(cansimple.command(axis.node, cansimple.CLEAR_ERRORS, cansimple.CLEAR.pack(0)))
+                self._clear_errors(axis)
+
+    def _clear_errors(self, axis: OdriveAxis) -> None:
+        self._wire.send(cansimple.command(axis.node, cansimple.CLEAR_ERRORS, cansimple.CLEAR.pack(0)))
 
     def _cut_power(self) -> None:
         idle = cansimple.AXIS_STATE.pack(AxisState.IDLE)
@@ -330,11 +341,12 @@ class Odrive(Driver[OdriveAxis]):
             wanted = self._target_state(axis)  # evaluated for each drive, since a failed send begins a quick stop
             if wanted is None or axis.requested is wanted:
                 continue
-            if wanted is AxisState.CLOSED_LOOP_CONTROL:  # sent at every power-up, since the drive may have restarted
+            if wanted is AxisState.CLOSED_LOOP_CONTROL and axis.modes_sent < MODES_SENT:
                 mode = cansimple.CONTROLLER_MODE.pack(cansimple.POSITION_CONTROL, cansimple.PASSTHROUGH)
                 if not self._wire.send(cansimple.command(axis.node, cansimple.SET_CONTROLLER_MODE, mode)):
                     return
-            if self._wire.send(
+                axis.modes_sent += 1
+            elif self._wire.send(
                 cansimple.command(axis.node, cansimple.SET_AXIS_STATE, cansimple.AXIS_STATE.pack(wanted))
             ):
                 axis.note_request(wanted)
