@@ -6,6 +6,7 @@ import itertools
 import random
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import groupby
 
 import can
 import msgspec
@@ -19,6 +20,7 @@ from rigs import STANDSTILL, STEP, Closing
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.inspection import inspect
 from trirail_drivers.config import NO_IO, DigitalIo
+from trirail_drivers.driver.row_updates import OUTPUT_REPEATS
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.simulated.device import Nmt
 from trirail_drivers.simulated.dictionary import UNSUPPORTED_ACCESS
@@ -38,8 +40,9 @@ def rig() -> Iterator[Rig]:
 
 
 def outputs_sent(rig: Rig) -> list[list[int]]:
-    """What each drive was sent by its frame of outputs since the record was cleared."""
-    return [[canopen_frames.OUTPUTS.unpack(data)[0] for data in each] for each in rig.sent_to(canopen_frames.RPDO3)]
+    """What each drive was sent by its frame of outputs since the record was cleared, without repetitions."""
+    sent = [[canopen_frames.OUTPUTS.unpack(data)[0] for data in each] for each in rig.sent_to(canopen_frames.RPDO3)]
+    return [[word for word, _ in groupby(each)] for each in sent]
 
 
 def by_sdo(rig: Rig, index: int) -> list[int]:
@@ -49,9 +52,9 @@ def by_sdo(rig: Rig, index: int) -> list[int]:
 
 
 def ready(rig: Rig) -> Rig:
-    """Set up, with the outputs sent once."""
+    """Set up, with the outputs sent, also for the last time."""
     rig.ready()
-    rig.cycle()
+    rig.cycles(1 + OUTPUT_REPEATS)
     rig.bus.sent.clear()
     return rig
 
@@ -148,6 +151,18 @@ def test_an_output_switches_at_the_sync_of_the_setpoint_it_was_written_with(rig:
     assert (change.sync, change.bits) == (before + 2, VALVE)
     assert change.time == pytest.approx(rig.clock.now - 2 * STEP)
     assert change.position == a.servo.position
+
+
+@pytest.mark.parametrize("lost", range(OUTPUT_REPEATS + 1))
+def test_outputs_are_repeated_since_a_frame_may_be_lost(rig: Rig, lost: int) -> None:
+    """In some cycles, and then no longer."""
+    device = ready(rig).devices[0]
+    rig.drives.set_outputs((VALVE, 0, 0))
+    if lost:
+        rig.bus.faults.add(f"A drop rpdo3 for {lost} frames")
+    rig.cycles(OUTPUT_REPEATS + 3)
+    assert device.pins.bits == VALVE
+    assert rig.sent_to(canopen_frames.RPDO3)[0] == [canopen_frames.OUTPUTS.pack(VALVE)] * (1 + OUTPUT_REPEATS)
 
 
 def test_only_named_bits_are_ever_sent(rig: Rig) -> None:

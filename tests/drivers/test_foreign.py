@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from rigs import STANDSTILL, Closing, Cycles, alike
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
+from trirail_drivers.cia402.canopen_frames import CONTROLWORD, ENABLE_OPERATION, INTERPOLATE
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.objects import FOLLOWING_BIT, USES
 from trirail_drivers.config import NO_IO, DigitalIo, Drives
@@ -180,6 +181,31 @@ def test_what_a_drive_lacks_or_contradicts_is_refused_by_name(
     with pytest.raises(DriveError, match=said):
         rig.ready()
     assert all(index == 0x6040 for node in rig.nodes for index, *_ in node.written)
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2])
+@pytest.mark.parametrize("shown", [True, False], ids=["bit 12", "no bit 12"])
+@pytest.mark.parametrize("name", [name for name, make in MAKES.items() if make.mode == 7])
+def test_lost_commands_to_interpolate_are_repeated(
+    closing: Closing, monkeypatch: pytest.MonkeyPatch, name: str, shown: bool, lost: int
+) -> None:
+    accepted = (*MAKES[name].keys.get("accept_without", ()), *(() if shown else (FOLLOWING_BIT,)))
+    rig = closing(Rig(name, accept_without=accepted))
+    rig.ready()
+    identifier = rig.drives._axes[1].exchange.controlword
+    send, word, left = rig.wires.send, ENABLE_OPERATION | INTERPOLATE, iter(range(lost))
+
+    def lose(message: can.Message, timeout: float | None = None) -> None:
+        starts = message.arbitration_id == identifier and message.data[:2] == CONTROLWORD.pack(word)
+        if not starts or next(left, None) is None:
+            send(message, timeout)
+
+    monkeypatch.setattr(rig.wires, "send", lose)
+    rig.enable()
+    rig.cycles(10)
+    rig.go(0.05, 60)
+    node = rig.nodes[1]
+    assert node.servo.position == pytest.approx(rig.nodes[0].servo.position, abs=1.0)
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,8 @@ ANSWER_TIME = 0.5
 STANDSTILL_DISTANCE_M = 2e-5
 """Distance [m] within which a slider must stay for STANDSTILL_TIME_S to count as at rest."""
 STANDSTILL_TIME_S = 0.1
+WORD_REPEATS = 2
+"""Number of times that the start of interpolation is sent again to a drive whose statusword does not show it."""
 SENSOR_ERRORS = 0x7300
 """Error codes 73xxh of CiA 402-2, which concern the encoder."""
 GENERIC_ERROR = 0x1000
@@ -67,6 +69,8 @@ class Cia402Axis(Axis):
         """Whether the drive has been sent a setpoint."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.controlword = canopen_frames.DISABLE_VOLTAGE
+        self.word_repeats = 0
+        """Number of times that the last controlword has been sent again."""
         self.mode_bits = 0
         """Mode-specific controlword bits, added to "enable operation"."""
         self.held: int | None = None
@@ -198,6 +202,7 @@ class Cia402Axis(Axis):
             and self.missed < self.missed_limit
             and self._followed == follows
             and self.controlword == self.word(-math.inf, wanted)
+            and not self.is_not_followed(self.controlword, wanted)
         )
 
     def expected_rows(self, number: int) -> list[tuple[Any, ...]]:
@@ -436,9 +441,15 @@ class Cia402Axis(Axis):
         """Whether the drive's state shows that a controlword has had no effect."""
         if self.state is PowerState.QUICK_STOP_ACTIVE:
             return word == canopen_frames.DISABLE_VOLTAGE
-        if wanted is PowerState.OPERATION_ENABLED:
-            return self.state in _ENABLING_STATES or not self.cyclic  # the state does not show the mode-specific bits
-        return self.state in _ENABLED_OR_ENABLING
+        if wanted is not PowerState.OPERATION_ENABLED:
+            return self.state in _ENABLED_OR_ENABLING
+        if self.state in _ENABLING_STATES or not self.cyclic:  # the state does not show the mode-specific bits
+            return True
+        if not word & canopen_frames.INTERPOLATE:
+            return False
+        if self.exchange.tells_following:
+            return not self.statusword & canopen_frames.FOLLOWS_SETPOINTS
+        return self.word_repeats < WORD_REPEATS
 
     def _is_at_rest(self, now: float) -> bool:
         """Whether the slider is at rest, judging by recent positions."""

@@ -34,6 +34,7 @@ from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.driver.row_updates import (
     count_sync,
     end_reading,
+    note_outputs,
     outputs_pending,
     put_outputs,
     put_setpoint,
@@ -306,18 +307,17 @@ class Cia402(Driver[Cia402Axis]):
                 axis.outputs_sent = NOTHING_SENT
             if not (outputs_pending(axis) and axis.configured):
                 continue
-            wanted = axis.outputs
             if by_pdo:
                 put_outputs(axis, self._tables.outputs.frames[number, DATA_AT:])
-                sent = self._wire.send(self._tables.outputs.frame(number)) and not silent
+                if self._wire.send(self._tables.outputs.frame(number)) and not silent:
+                    note_outputs(axis)
             elif axis.unanswered or self._is_being_configured(axis):  # a server handles one request at a time (CiA 301)
                 continue
             else:
-                word = canopen_frames.OUTPUTS.pack(wanted | axis.outputs_kept)
-                sent = self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + word)
+                word = canopen_frames.OUTPUTS.pack(axis.outputs | axis.outputs_kept)
+                if self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + word):
+                    axis.outputs_sent, axis.outputs_repeats = axis.outputs, 0
                 axis.poll_due = now + canopen_frames.POLL_PERIOD  # another request could overwrite this one
-            if sent:
-                axis.outputs_sent = wanted
 
     def _make_outputs_safe(self) -> None:
         """Write the safe values of the outputs and wait for the answers. SDOs also work in NMT pre-operational."""
@@ -494,6 +494,7 @@ class Cia402(Driver[Cia402Axis]):
                 # PDOs are received only in NMT operational (CiA 301), so stop commands are sent by PDO and SDO.
                 self._send_word_by_sdo(axis, word)
             if self._send_word(axis, word):
+                axis.word_repeats = axis.word_repeats + 1 if word == axis.controlword else 0
                 axis.controlword = word
                 axis.command_age = 0
 

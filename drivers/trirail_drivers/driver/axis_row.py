@@ -73,6 +73,8 @@ class AxisRow(ctypes.Structure):
     """Wanted digital outputs: bits of 60FEh:01, limited to the mask."""
     outputs_sent: int
     """Digital outputs that the bus accepted last; NOTHING_SENT if it has accepted none since the set-up."""
+    outputs_repeats: int
+    """Number of frames that still repeat the outputs sent last, since a drive may have missed them."""
     inputs: int
     """Newest digital inputs: bits of 60FDh, limited to the mask."""
 

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from trirail_drivers.driver.axis_row import NO_OFFSET
 from trirail_drivers.driver.scaling import FLOAT32_MAX, INT32_MAX
 
+OUTPUT_REPEATS = 2
+"""Number of cycles in which the frame of changed outputs is sent again."""
+
 if TYPE_CHECKING:
     from trirail_drivers.driver.axis_row import AxisRow
 
@@ -127,11 +130,17 @@ def put_setpoint(row: AxisRow, data: NDArray[np.uint8]) -> None:
 
 
 def outputs_pending(row: AxisRow) -> bool:
-    """Whether the wanted outputs differ from the outputs sent last, or no outputs have been sent yet."""
-    return row.has_outputs and row.outputs != row.outputs_sent
+    """Whether the wanted outputs differ from the outputs sent last, must be repeated, or have not been sent yet."""
+    return row.has_outputs and (row.outputs != row.outputs_sent or row.outputs_repeats > 0)
 
 
 def put_outputs(row: AxisRow, data: NDArray[np.uint8]) -> None:
     """Write the wanted outputs into the data of their frame, beside the outputs that the robot does not use."""
     for i in range(4):
         data[i] = (row.outputs | row.outputs_kept) >> 8 * i & 0xFF
+
+
+def note_outputs(row: AxisRow) -> None:
+    """Record that the bus has accepted a frame with the wanted outputs. No answer shows whether the drive got it."""
+    row.outputs_repeats = OUTPUT_REPEATS if row.outputs != row.outputs_sent else row.outputs_repeats - 1
+    row.outputs_sent = row.outputs

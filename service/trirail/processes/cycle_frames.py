@@ -148,6 +148,7 @@ _scale_setpoint: Any = compiled()(row_updates.scale_setpoint)
 _put_setpoint: Any = compiled()(row_updates.put_setpoint)
 _outputs_pending: Any = compiled()(row_updates.outputs_pending)
 _put_outputs: Any = compiled()(row_updates.put_outputs)
+_note_outputs: Any = compiled()(row_updates.note_outputs)
 
 
 @compiled()
@@ -283,7 +284,9 @@ def send_outputs(
     axes: NDArray[np.void],
     times: NDArray[np.void],
 ) -> bool:
-    """Send the outputs that have changed, in one frame per drive. Return True if the bus has accepted all frames.
+    """Send the outputs that have changed or must be repeated, in one frame per drive.
+
+    Return True if the bus has accepted all frames.
 
     `headers` and `frames` are the arrays of a PackedFrames with one frame per drive, or are empty.
     """
@@ -293,7 +296,7 @@ def send_outputs(
             _put_outputs(axis, frames[i, DATA_AT:])
             if not send_frames(bus, headers[i : i + 1], frames[i : i + 1], times):
                 return False
-            axis.outputs_sent = axis.outputs
+            _note_outputs(axis)
     return True
 
 
