@@ -173,6 +173,14 @@ def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: C
     assert slow.outcomes() == [("running", "stopped"), ("g1", "stopped")]
 
 
+def test_missed_ticks_are_reported_also_at_rest(slow: ControlRig) -> None:
+    for number in (1, 2):
+        slow.control.modes.handle_disturbance(ModeEvent.LATE, coded("3 ticks missed", EventCode.OTHER))
+        slow.cycle()
+        assert slow.mode is Mode.HOLDING
+        assert [notice.message for notice in slow.notices].count("3 ticks missed") == number
+
+
 def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: ControlRig) -> None:
     slow.post("g1", FAR)
     slow.control.modes.handle_disturbance(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))

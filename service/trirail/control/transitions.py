@@ -139,7 +139,9 @@ class Transitions:
     def handle_disturbance(self, event: ModeEvent, reason: EventText) -> None:
         """Handle the loss of the gateway, a series of late ticks, or the shutdown of the service."""
         decided = step(self.state, event)
-        if not isinstance(decided, Refusal) and decided.state != self.state:
+        changes = not isinstance(decided, Refusal) and decided.state != self.state
+        # Missed ticks are reported even if the robot is already at rest with power, since a motion would have stopped.
+        if changes or (event is ModeEvent.LATE and self.state.mode is Mode.HOLDING):
             self._ledger.notices.append(Notice("service", "warning", reason.text, **reason.fields))
             self.apply_event(event, reason)
         self.withdraw(event, reason)
