@@ -357,6 +357,32 @@ def test_a_position_that_jumps_for_a_cycle_moves_no_setpoint(rig: Cia402Rig) -> 
     assert np.array(poses) == pytest.approx(np.zeros((4, 3)), abs=1e-9)
 
 
+@pytest.mark.parametrize("before", ["new", "disable", "quick_stop"])
+@pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize("metres", [0.03, -0.01])
+@pytest.mark.parametrize("cycles", [1, 2, 100])
+def test_a_position_that_jumps_without_power_and_stays_is_reported_once(
+    rig: Cia402Rig, before: str, index: int, metres: float, cycles: int
+) -> None:
+    if before != "new":
+        rig.enable()
+        rig.command(before)
+        rig.cycles(100)
+    rig.cycles(3)
+    last = rig.control.measured.feedback.position[index]
+    by_hand(rig, index, metres)
+    rig.cycles(cycles)
+    if cycles < 100:  # one or two wrong frames
+        by_hand(rig, index, -metres)
+    rig.cycles(20)
+    moved = [notice for notice in rig.notices if notice.event_code == "slider_moved"]
+    assert len(moved) == (cycles == 100)
+    for notice in moved:
+        assert notice.level == "warning"
+        places = notice.params["position_before"], notice.params["position"]
+        assert places == pytest.approx((last, last + metres), abs=1e-6)
+
+
 def test_a_slider_moved_by_hand_is_followed_without_a_jump_before_it_is_enabled(rig: Cia402Rig) -> None:
     rig.cycles(3)
     for index in range(3):

@@ -772,6 +772,13 @@ def test_who_enables_while_sliders_are_pushed_by_hand_is_answered_alike(seed: in
     both_ways(CONFIGS["cia402"], tmp_path, pushes, 600)
 
 
+@pytest.mark.parametrize("protocol", CONFIGS)
+def test_a_position_that_jumps_without_power_is_reported_alike_and_once(protocol: str, tmp_path: Path) -> None:
+    jump = Happening(partial(_push, slider=1, by=0.02))
+    session = both_ways(CONFIGS[protocol], tmp_path, lambda: {200: [jump]}, 400)
+    assert sum("its position has jumped" in repr(each) for each in session.heard) == 1
+
+
 def _push(session: Session, slider: int, by: float) -> None:
     session.drives.faults.carriages.push(slider, by)
 

@@ -146,6 +146,8 @@ class Control:
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
         if stopped_now or mode in (Mode.ENABLING, Mode.HOMING):
             return None
+        if self._returning.watches_jump:
+            return None
         if self.measured.feedback.fault is not None:  # Python reads and notes that a reset has cleared it
             return None
         if self.outputs.any:
@@ -307,6 +309,8 @@ class Control:
         before = self.measured.feedback
         if behind is None:
             behind = self.measured.update(feedback, self._at_rest)
+        if self.state.mode in (Mode.DISABLED, Mode.FAULT):
+            self._report_jumps(feedback)
         self.report_feedback(before, feedback)
         if not self.ahead:
             self._handle_edges(self.ledger.goal)
@@ -350,6 +354,15 @@ class Control:
             text = coded(warning, EventCode.DRIVE_WARNING, warning=warning)
             self.ledger.notices.append(Notice("service", "warning", warning, **text.fields))
         for level, text in self._returning.update(feedback):
+            self.ledger.notices.append(Notice("service", level, text.text, **text.fields))
+
+    def _report_jumps(self, feedback: Feedback) -> None:
+        """Report sliders without power whose positions have jumped, for instance because a drive has a new zero."""
+        a, b, c = (
+            position - velocity * self._period
+            for position, velocity in zip(feedback.position, self.measured.velocity, strict=True)
+        )
+        for level, text in self._returning.update_jumps(feedback, self.measured.jumps, (a, b, c)):
             self.ledger.notices.append(Notice("service", level, text.text, **text.fields))
 
     def solve(self) -> None:

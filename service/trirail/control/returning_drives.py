@@ -9,6 +9,9 @@ from trirail_drivers.interface import Feedback, Triple, Unready
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import Level
 
+JUMP_CYCLES = 3
+"""Number of cycles after which a position that has jumped must still be elsewhere, which a wrong frame is not."""
+
 
 class ReturningDrives:
     """Detector of drives that are lost or have been configured again. It compares successive feedback."""
@@ -20,6 +23,41 @@ class ReturningDrives:
         self._before: tuple[Unready | None, ...] = (None, None, None)
         self._last: list[float | None] = [None, None, None]
         """Position of each drive when it was lost [m]; None if it was not homed."""
+        self._jumped: dict[int, tuple[float, int]] = {}
+        """Position before a jump [m], and number of cycles since then, of each slider that has jumped."""
+
+    @property
+    def watches_jump(self) -> bool:
+        """Whether a position has jumped, and the next cycles show whether it stays there."""
+        return bool(self._jumped)
+
+    def update_jumps(
+        self, feedback: Feedback, jumps: tuple[bool, bool, bool], before: Triple
+    ) -> Iterator[tuple[Level, EventText]]:
+        """Yield a warning for each slider whose position has jumped and stays there. Call this before `update`.
+
+        Parameters
+        ----------
+        jumps
+            Whether the position of each slider has changed faster than the slider can move.
+        before
+            Positions in the previous cycle [m].
+
+        """
+        for i, (jumps_now, position) in enumerate(zip(jumps, feedback.position, strict=True)):
+            if feedback.unready[i] is not None or self._before[i] is not None:  # `update` compares the positions
+                self._jumped.pop(i, None)
+            elif i in self._jumped or jumps_now:
+                last, cycles = self._jumped.pop(i, (before[i], 0))
+                if cycles < JUMP_CYCLES:
+                    self._jumped[i] = last, cycles + 1
+                elif abs(position - last) > self._windows[i]:
+                    words = (
+                        f"slider {self._labels[i]}: its position has jumped, without power, from {last * 1e3:.3f} mm "
+                        f"to {position * 1e3:.3f} mm: check it before you enable"
+                    )
+                    fields = {"position_before": last, "position": position}
+                    yield "warning", coded(words, EventCode.SLIDER_MOVED, slider=self._labels[i], **fields)
 
     def update(self, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
         """Yield a level and a message for each drive that has been lost or has returned."""

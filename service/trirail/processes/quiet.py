@@ -64,7 +64,9 @@ class Reached(IntEnum):
     SYNCED = 1
     """The SYNC has been sent, as far as the bus has accepted it. Frames may have been received."""
     OBSERVED = 2
-    """The feedback has been evaluated, and a following error exceeds its limit."""
+    """The feedback has been evaluated, and a following error exceeds its limit, or the position of a slider without
+    power has jumped.
+    """
     SOLVED = 3
     """The setpoints have been calculated, but not sent.
 
@@ -322,7 +324,7 @@ def solve(
         *(robot.legs, robot.feedback, robot.written, robot.backlash, s.period, s.fastest, s.limit, s.at_rest),
         *(robot.jumps, robot.scratch, robot.monitored, robot.record),
     )
-    if s.behind:
+    if s.behind or (s.source == FOLLOW and (robot.jumps[0] or robot.jumps[1] or robot.jumps[2])):
         return Reached.OBSERVED
     _mark(state, moment, Part.MOTION)
 
