@@ -399,7 +399,7 @@ def test_a_procedure_that_a_drive_begins_by_itself_stops_the_robot_and_is_ended(
     """Without power before, the idle state that is wanted has been requested long ago."""
     rig.cycles(50)
     rig.inject(f"B drop set_axis_state for {lost} frames" if lost else "error-passive")
-    rig.odrives[1].axis_state = state
+    rig.odrives[1].axis_state = state  # type: ignore[assignment]
     rig.until(rig.faulty, BEAT)
     assert rig.control.fault == f"drive B: runs {cansimple.state_name(state)}, which the service did not request"
     assert rig.control.measured.powered
@@ -416,7 +416,7 @@ def test_a_drive_that_does_not_end_its_procedure_is_named_and_commands_are_answe
 ) -> None:
     rig.cycles(50)
     rig.odrives[1]._handlers[cansimple.SET_AXIS_STATE] = lambda data: None
-    rig.odrives[1].axis_state = 9
+    rig.odrives[1].axis_state = 9  # type: ignore[assignment]
     rig.cycles(1500)
     answer = rig.command(command)
     assert isinstance(answer, Refused)
