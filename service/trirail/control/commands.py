@@ -189,11 +189,9 @@ class Commands:
 
     def _home(self, request: CommandRequest) -> None:
         if not self._can_home:
-            words = (
-                "the encoders are absolute: homing is not needed"
-                if self._measured.homed
-                else "no drive can be homed: to accept the positions as they are, restart the service"
-            )
+            if self._measured.homed:
+                raise RefusedError(RefusalCode.NOTHING_TO_HOME, "the encoders are absolute: homing is not needed")
+            words = "no drive can be homed: to accept the positions as they are, restart the service"
             raise RefusedError(RefusalCode.NOTHING_TO_HOME, words)
         self._change_mode(request)
 
