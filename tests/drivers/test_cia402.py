@@ -404,19 +404,15 @@ class TestFaults:
         for device in ready.devices:
             device.silent = False
 
-    @pytest.mark.parametrize("has_code", [True, False])
     @pytest.mark.parametrize("code", [0x2310, 0x3220, 0x4310, 0x7380, 0xFF01])
-    def test_an_error_from_before_the_set_up_is_reported_until_it_ends(
-        self, new: Rig, code: int, has_code: bool
-    ) -> None:
-        """Without a fault state: by the error register, and by the error code if the drive has one."""
+    def test_an_error_from_before_the_set_up_is_reported_until_it_ends(self, new: Rig, code: int) -> None:
+        """Without a fault state, by the error register and the error code."""
         device = new.devices[1]
         device.errors.report(code)
-        shown = code if has_code else 0x1000
-        device.objects[0x603F, 0].value = code if has_code else 0
+        device.objects[0x603F, 0].value = code
         new.drives.configure(PERIOD)
         fault = new.found("emcy", within=1)
-        assert fault[:3] == ("B", "emcy", shown)
+        assert fault[:3] == ("B", "emcy", code)
         assert "is still in force" in fault.message
         new.drives.reset()
         new.cycles(490)
@@ -424,6 +420,14 @@ class TestFaults:
         device.errors.clear(code)
         new.drives.reset()
         assert new.cycles(1000).fault is None
+
+    def test_an_error_without_a_code_is_a_warning(self, new: Rig) -> None:
+        new.devices[1].errors.report(0xFF01)
+        new.devices[1].objects[0x603F, 0].value = 0
+        new.drives.configure(PERIOD)
+        feedback = new.cycle()
+        assert feedback.fault is None
+        assert [each for each in feedback.warnings if "drive B: its error register 1001h" in each]
 
     def test_a_communication_error_from_before_the_set_up_ends_with_it(self, new: Rig) -> None:
         new.devices[1].errors.report(0x8130)

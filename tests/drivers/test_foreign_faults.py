@@ -128,6 +128,27 @@ def test_two_masters_are_noticed(rig: Rig, identifier: int | None, data: bytes, 
         assert said in stopped_within(rig, 1)
 
 
+@pytest.mark.parametrize(
+    ("request_data", "stops"),
+    [
+        (b"\x2b\x40\x60\x00\x06\x00\x00\x00", True),
+        (b"\xc2\x10\x10\x01\x0e\x00\x00\x00", True),
+        (b"\x40\x41\x60\x00\x00\x00\x00\x00", False),
+        (b"\x60\x00\x00\x00\x00\x00\x00\x00", False),
+    ],
+)
+def test_another_who_writes_to_a_drive_by_sdo_stops_all_and_who_reads_does_not(
+    rig: Rig, request_data: bytes, stops: bool
+) -> None:
+    with stranger(rig) as bus:
+        rig.wires.nodes.remove(rig.nodes[1])  # it does not answer
+        bus.send(frame(0x600 + rig.drives._axes[1].node, request_data))
+        feedback = rig.cycle(rig.target, (0.0, 0.0, 0.0))
+    assert (feedback.fault is not None) == stops
+    if feedback.fault is not None:
+        assert "another master is on the bus and writes to drive B by SDO" in feedback.fault.message
+
+
 @pytest.mark.parametrize("apart", [1, -40, 16_000_000])
 def test_a_second_node_with_the_same_id_is_noticed(rig: Rig, apart: int) -> None:
     """Its slider may be anywhere: also beside this one [counts], as of a drive that was copied and not moved."""

@@ -34,8 +34,6 @@ WORD_REPEATS = 2
 """Number of times that the start of interpolation is sent again to a drive whose statusword does not show it."""
 SENSOR_ERRORS = 0x7300
 """Error codes 73xxh of CiA 402-2, which concern the encoder."""
-GENERIC_ERROR = 0x1000
-"""Error code of CiA 301 for an error without a more specific code."""
 RESET_TIME = 2 * canopen_frames.STATUS_PERIOD
 """Longest time until a drive leaves the fault state after a fault reset [s]: two periods of its statusword."""
 
@@ -353,12 +351,10 @@ class Cia402Axis(Axis):
     def start_error(self, code: int, *, in_error: bool) -> None:
         """Store the error that the drive had at the end of its set-up, with the error code 603Fh or 0.
 
-        If the error register shows an error without a code, the code is that of the last EMCY, if there was one.
+        If the error register shows an error without a code, the code remains that of the last EMCY, if there was one.
         """
         if code or not in_error:
             self.error_code = code
-        elif not self.error_code:
-            self.error_code = GENERIC_ERROR
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Handle a heartbeat, an answer to node guarding, or a boot-up message."""

@@ -145,6 +145,8 @@ class Cia402(Driver[Cia402Axis]):
         axis.inputs = start.inputs & axis.io.inputs
         axis.update_status(start.statusword, axis.status_heard)
         axis.start_error(start.error_code, in_error=start.in_error)
+        if start.in_error and not axis.error_code:
+            self._wire.warn(f"drive {axis.name}: its error register 1001h shows an error, without an error code")
 
     def _prepare_frames(self) -> None:
         """Create the frames that each cycle sends."""

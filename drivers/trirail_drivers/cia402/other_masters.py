@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import Final
 
 import can
@@ -27,12 +28,14 @@ _COMMANDS: Final = {
 }
 _NMT_START: Final = 0x01
 _NMT_STOP: Final = 0x02
+_DOWNLOADS: Final = (1, 6)
+"""Client command specifiers, bits 5 to 7 of the first byte of an SDO request, which begin a download (CiA 301)."""
 
 
 class OtherMasters:
     """Detection of other masters on the bus by frames that only this service may send.
 
-    These frames are NMT commands, SYNC, SDO requests and PDOs to the drives, and heartbeats with this service's node
+    These frames are NMT commands, SYNC, PDOs and SDO downloads to the drives, and heartbeats with this service's node
     id. The bus does not return the frames that this service sends.
     """
 
@@ -44,8 +47,7 @@ class OtherMasters:
         wire.listen(canopen_frames.SYNC, self, self._sends("sends SYNC"))
         wire.listen(canopen_frames.HEARTBEAT + master_node, self, self._on_heartbeat)
         for axis in axes:
-            by_sdo = self._sends(f"accesses drive {axis.name} by SDO")
-            wire.listen(canopen_frames.SDO_REQUEST + axis.node, self, by_sdo)
+            wire.listen(canopen_frames.SDO_REQUEST + axis.node, self, partial(self._on_sdo_request, axis.name))
             self.listen_to(axis)
 
     def listen_to(self, axis: Cia402Axis) -> None:
@@ -78,6 +80,11 @@ class OtherMasters:
         name = _COMMANDS.get(command, f"{command:02X}h")
         whom = "all nodes" if node == 0 else f"drive {addressed[0].name}"
         self._warn(f'commands {whom} by NMT "{name}"')
+
+    def _on_sdo_request(self, name: str, data: bytearray, now: float) -> None:  # noqa: ARG002
+        """Handle an SDO request of another client. A program that only reads values does not disturb the robot."""
+        if data and data[0] >> 5 in _DOWNLOADS:
+            self._warn(f"writes to drive {name} by SDO")
 
     def _on_heartbeat(self, data: bytearray, now: float) -> None:  # noqa: ARG002
         canopen_frames.NMT_STATE.unpack(data)
