@@ -410,6 +410,23 @@ def test_a_procedure_that_a_drive_begins_by_itself_stops_the_robot_and_is_ended(
 
 
 @pytest.mark.parametrize("mode", ["holding"])
+def test_a_drive_that_has_restarted_finishes_its_start_before_it_is_configured(rig: OdriveRig, mode: str) -> None:
+    rig.enable()
+    rig.inject("B reboot")
+    rig.until(rig.faulty, ASKED)
+    rig.until(lambda: rig.odrives[1].axis_state == AxisState.IDLE, 5000)
+    begun = len(rig.rows)
+    rig.odrives[1].axis_state = 6  # type: ignore[assignment]
+    rig.cycles(500)
+    assert [state for at, state in rig.states_of[1] if at > begun + BEAT] == []
+    assert rig.odrives[1].axis_state == 6
+    rig.odrives[1].axis_state = AxisState.IDLE
+    rig.until(lambda: not rig.control.measured.unready, 5000)
+    assert isinstance(rig.command("reset"), CommandDone)
+    rig.enable()
+
+
+@pytest.mark.parametrize("mode", ["holding"])
 @pytest.mark.parametrize("command", ["disable", "quick_stop", "reset"])
 def test_a_drive_that_does_not_end_its_procedure_is_named_and_commands_are_answered(
     rig: OdriveRig, command: str, mode: str

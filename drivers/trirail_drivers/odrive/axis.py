@@ -137,8 +137,11 @@ class OdriveAxis(Axis):
         if not cansimple.is_starting(self.state, errors):
             self._started = True
         if self.requested is not AxisState.CLOSED_LOOP_CONTROL:
-            if self.powered and self.state_is_current:
-                self.requested = None  # the drive has power that the service does not want: request idle again
+            # Request idle again if the drive has power that the service does not want. A drive that has restarted may
+            # finish the procedures of its own start first, such as an index search, without which it has no position.
+            unwanted = self.state == AxisState.CLOSED_LOOP_CONTROL or (self.powered and not self.restarted)
+            if unwanted and self.state_is_current:
+                self.requested = None
         elif self.state == AxisState.CLOSED_LOOP_CONTROL:
             self.powered_up = True
         elif self.state_is_current and not self.powered_up:
