@@ -73,6 +73,7 @@ CANOPEN: dict[str, dict[str, object]] = {
         "INTERPOLATE": 0x0010,
         "FOLLOWS_SETPOINTS": 0x1000,
     },
+    "CiA 402-2, statusword 6041h: bit 9": {"REMOTE": 0x0200},
     "CiA 402-2, controlword 6040h: coding of commands, and bits 4 and 8": {
         "CONTROLWORD": "<H",
         "DISABLE_VOLTAGE": 0b0000_0000,
@@ -332,7 +333,7 @@ def test_the_odrive_driver_by_its_bytes() -> None:
     ]  # fmt: skip
     rig.enable()
     said = sent(rig.bus)
-    assert [frame for frame in said if frame[:3] == "0EB"] == ["0EB#0300000001000000"]
+    assert [frame for frame in said if frame[:3] == "0EB"] == ["0EB#0300000001000000"] * 3
     assert [frame for frame in said if frame[:3] == "0E7"] == ["0E7#0800000000000000"]
     # At -0.02 m with 50 turns/m downwards from 0.1 m: 6 turns.
     assert "0EC#0000C04000000000" in said
