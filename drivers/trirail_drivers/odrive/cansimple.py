@@ -208,10 +208,10 @@ TRAFFIC: Final = Traffic(
     cycle=3 * (INPUT_POS.size, 0, ESTIMATES.size),
     periodic=((0, ERROR_PERIOD), (ERRORS.size, ERROR_PERIOD)),
     heartbeats=3 * (BEAT.size,),
-    most_sent=13,
+    most_sent=10,
 )
 """Traffic of one cycle: three setpoints, three requests, three encoder estimates.
 
-In one cycle, the service sends at most three setpoints, three requests, a mode and a state for each drive, and one
+In one cycle, the service sends at most three setpoints, three requests, a mode or a state for each drive, and one
 error request.
 """
