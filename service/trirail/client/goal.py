@@ -129,6 +129,7 @@ class AsyncGoalHandle:
         finally:
             ended.cancel()
             silent.cancel()
+            await asyncio.wait((ended, silent))
         if self._result is None and self._ended.is_set():
             raise ServiceError(self._lost)
         if self._result is None:
