@@ -7,6 +7,7 @@ kind of message. With --check, nothing is written, and the exit code is 1 if a f
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import sys
 from pathlib import Path
@@ -74,6 +75,8 @@ def schemas() -> dict[str, str]:
                 del definition["enum"]
                 definition["oneOf"] = [{"const": code, "description": _described(code)} for code in EventCode]
                 continue
+            if "description" in definition:  # msgspec before 0.23 keeps the indentation of docstrings
+                definition["description"] = inspect.cleandoc(definition["description"])
             struct_type = next(getattr(module, struct) for module in MODULES if hasattr(module, struct))
             if struct == state.Pose.__name__:  # an array: its items carry the descriptions of the fields
                 texts = docstrings.fields(struct_type).items()

@@ -56,8 +56,9 @@ class ReturningDrives:
                         f"slider {self._labels[i]}: its position has jumped, without power, from {last * 1e3:.3f} mm "
                         f"to {position * 1e3:.3f} mm: check it before you enable"
                     )
-                    fields = {"position_before": last, "position": position}
-                    yield "warning", coded(words, EventCode.SLIDER_MOVED, slider=self._labels[i], **fields)
+                    label = self._labels[i]
+                    text = coded(words, EventCode.SLIDER_MOVED, slider=label, position_before=last, position=position)
+                    yield "warning", text
 
     def update(self, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
         """Yield a level and a message for each drive that has been lost or has returned."""
