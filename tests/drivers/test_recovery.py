@@ -333,19 +333,21 @@ def test_settings_that_read_back_different_are_named_and_the_service_stays() -> 
     rig.bus.shutdown()
 
 
-def relative(drive: SimulatedOdrive) -> None:
+def relative_rig() -> AbsentRig:
+    """A robot of ODrives, of which drive A has a relative position."""
+    rig = AbsentRig((0,), ODRIVES)
+    drive = rig.bus.drives[0]
+    assert isinstance(drive, SimulatedOdrive)
     drive.version = Version((5, 2, 0), (0, 6, 8))  # tells it
     drive.settings[POSITION_STATUS] = RELATIVE_MODE
+    rig.supply(0)
+    rig.recover()
+    return rig
 
 
 def test_an_odrive_whose_position_is_relative_is_not_homed_after_a_restart() -> None:
     """Its position at the first set-up counts, whenever it appears."""
-    rig = AbsentRig((0,), ODRIVES)
-    drive = rig.bus.drives[0]
-    assert isinstance(drive, SimulatedOdrive)
-    relative(drive)
-    rig.supply(0)
-    rig.recover()
+    rig = relative_rig()
     assert rig.said("drive A: axis0.pos_vel_mapper.status is 9, relative")
     rig.cut(0)
     rig.cycles(300)
@@ -365,12 +367,7 @@ def test_an_odrive_whose_position_is_relative_is_not_homed_after_a_restart() -> 
 
 @pytest.mark.parametrize("seconds", [0.2, 0.4, 2.0])
 def test_an_odrive_whose_position_is_relative_keeps_it_through_silence(seconds: float) -> None:
-    rig = AbsentRig((0,), ODRIVES)
-    drive = rig.bus.drives[0]
-    assert isinstance(drive, SimulatedOdrive)
-    relative(drive)
-    rig.supply(0)
-    rig.recover()
+    rig = relative_rig()
     rig.command("disable")
     rig.bus.faults.add(f"A silent for {seconds}")
     rig.cycles(200)
