@@ -269,11 +269,12 @@ def stop(name: str, *, at_port: bool = False) -> Incoming:
     return Incoming("cmd", "trirail/demo/cmd/ann/stop", 0, b"", "", query, 0, id=name)
 
 
-def test_a_copy_of_what_was_refused_for_want_of_room_is_carried_out() -> None:
+@pytest.mark.parametrize("code", [RefusalCode.BUSY, RefusalCode.NO_GOAL])
+def test_a_copy_of_what_was_refused_is_carried_out_only_if_there_was_no_room(code: RefusalCode) -> None:
     copies = Copies()
     sent = copies.add(stop("a"))
-    assert copies.answered(sent, ErrorReply(RefusalCode.BUSY, "send fewer")) is None
-    assert copies.first(stop("a", at_port=True)) is None
+    assert copies.answered(sent, ErrorReply(code, "no")) is None
+    assert copies.first(stop("a", at_port=True)) is (None if code is RefusalCode.BUSY else sent.pair)
 
 
 @given(late=st.floats(0.0, 2.0 * COPY_WITHIN_S), answer_after=st.floats(0.0, 100.0))
