@@ -222,6 +222,25 @@ def test_the_language_is_the_browser_s_or_that_of_the_switch_and_keeps_the_lease
 
 @pytest.mark.viewer
 @needs_chromium
+def test_the_language_that_was_chosen_last_stays_whichever_arrives_last(page: Page) -> None:
+    page.evaluate(
+        "(() => { const real = fetch; window.arrived = [];"
+        " self.fetch = async (name) => {"
+        "   await new Promise((later) => setTimeout(later, { 'de.json': 300, 'en.json': 50 }[name] ?? 0));"
+        "   const answer = await real(name); setTimeout(() => arrived.push(name), 50); return answer; }; })()"
+    )
+    page.choose("#language", "de")
+    page.choose("#language", "en")
+    page.evaluate("document.querySelector('#answer').textContent = 'what was said'")
+    page.until("arrived.length === 2")
+    assert page.evaluate("arrived") == ["en.json", "de.json"]
+    assert page.evaluate("document.documentElement.lang") == "en"
+    assert page.text("#answer") == "what was said", "the language has not changed, so nothing is shown anew"
+    page.evaluate("localStorage.clear()")
+
+
+@pytest.mark.viewer
+@needs_chromium
 def test_a_browser_that_keeps_nothing_shows_the_page_and_stops(browser: Page, robot: FakeRobot) -> None:
     """It may be set to refuse cookies and all else of pages; what asks for that then fails."""
     with Panel(robot.robot(), 0) as panel:

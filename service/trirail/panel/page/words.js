@@ -3,7 +3,8 @@
 const KEPT = "trirail language";
 const ATTRIBUTES = { sayLabel: "aria-label", sayTitle: "title", sayPlaceholder: "placeholder" };
 let words = {};
-let language = "en";
+let language; // that is shown
+let wanted; // that was chosen last
 const formats = new Map();
 const listeners = [];
 
@@ -57,8 +58,12 @@ function stored() {
   }
 }
 
+// Show the page in a language. Of two that are chosen quickly, the one chosen last stays, whichever arrives last.
 async function show(code) {
-  words = await fetched(`${code}.json`);
+  wanted = code;
+  const arrived = await fetched(`${code}.json`);
+  if (code !== wanted || code === language) return;
+  words = arrived;
   document.documentElement.lang = language = code;
   formats.clear();
   for (const element of document.querySelectorAll("[data-say]")) element.textContent = say(element.dataset.say);
