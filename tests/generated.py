@@ -12,11 +12,12 @@ import functools
 import json
 import random
 import re
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from _pytest.mark import ParameterSet
 from hypothesis import HealthCheck, Phase, is_hypothesis_test, seed, settings
 from hypothesis.database import DirectoryBasedExampleDatabase
 from hypothesis.internal.conjecture import providers
@@ -34,6 +35,12 @@ FEWEST = 3
 
 RUNS = pytest.StashKey[int]()
 """How often the body of a test has run."""
+
+
+def thinned(cases: Iterable[Any], every: int = 2) -> list[ParameterSet]:
+    """Of the cases of a test, `make test` has one of so many, from the first on; `make test-all` has them all."""
+    each = (case if type(case) is tuple else (case,) for case in cases)
+    return [pytest.param(*case, marks=pytest.mark.long if number % every else ()) for number, case in enumerate(each)]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -21,6 +21,7 @@ from typing import Any
 import msgspec
 import pytest
 from cyclopts import App
+from generated import thinned
 from hypothesis import example, given
 from hypothesis import strategies as st
 from trirail.cli import app, help_pages, live, notation, recording_commands, terminal, view
@@ -201,7 +202,7 @@ def test_a_folder_that_cannot_be_read_is_not_an_empty_one(
 
 
 @pytest.mark.parametrize("line", ["fk 0 0 0", "fk 0 0 0 --json", "fk 9 9 9 --json", "help all"])
-@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("unbuffered", thinned(["", "1"]))
 def test_output_to_a_full_disk_is_an_error_in_one_line(line: str, unbuffered: str) -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(
@@ -263,7 +264,7 @@ def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code:
     assert said in run(*line.split())[2]
 
 
-@pytest.mark.parametrize("command", ["stop", "status", "fleet", "view --web"])
+@pytest.mark.parametrize("command", thinned(["stop", "status", "fleet", "view --web"], every=4))
 def test_a_folder_of_the_environment_is_for_certificates_alone(
     command: str, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from commissioning.test_guide import Beside, Run
+from generated import thinned
 from msgspec import structs
 from trirail.config import SIM, Config, load
 from trirail_drivers.interface import NAMES
@@ -19,7 +20,7 @@ OF_PARTS = ("B against", "A loose", "C slips 0.3", "B play 0.0003")
 
 
 @pytest.mark.generated(0, 1)
-@pytest.mark.parametrize("path", SIMULATED, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", thinned(SIMULATED, every=3), ids=lambda path: path.stem)
 def test_one_pass_corrects_the_file_and_the_next_finds_nothing(path: Path, seed: int, tmp_path: Path) -> None:
     chance = random.Random(f"{path.stem}{seed}")
     faults = chance.choice(TURNED).split("|")

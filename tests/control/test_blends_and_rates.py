@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from control.sessions import Session, assert_within_limits
+from generated import thinned
 from trirail.motion.paths import law_falls
 from trirail.wire.goal_kind import OwnLimits
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, VelocityGoal
@@ -68,7 +69,7 @@ def rate(session: Session) -> float:
     return last.law_state.rate if last is not None else 0.0
 
 
-@pytest.mark.parametrize("at", [20, 40, 70, 100, 150, 250])
+@pytest.mark.parametrize("at", thinned([20, 40, 70, 100, 150, 250]))
 @pytest.mark.parametrize("override", [0.01, 0.05, 0.3, 0.8])
 def test_a_lower_override_acts_as_quickly_as_a_pause(override: float, at: int) -> None:
     """While the robot accelerates, only a slow change fits at first, but not for long."""
@@ -152,7 +153,7 @@ def test_the_override_acts_again_when_the_goal_that_forbids_it_has_gone(how: str
 
 
 @pytest.mark.parametrize("every", [20, 100, 400])
-@pytest.mark.parametrize("override", [0.01, 0.03, 0.05])
+@pytest.mark.parametrize("override", thinned([0.01, 0.03, 0.05], every=3))
 def test_a_renewed_jog_moves_at_every_override(override: float, every: int) -> None:
     session = Session()
     session.order(Command.OVERRIDE, override)

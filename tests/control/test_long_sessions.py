@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from control.sessions import Session, assert_within_limits
 from control_rig import CONFIG
+from generated import thinned
 from numpy.typing import NDArray
 from trirail.config import Config, corrected_geometry, geometry
 from trirail.config.as_built import AsBuilt, geometry_of
@@ -125,7 +126,7 @@ class Progress:
 
 @pytest.mark.timeout(3600)
 @pytest.mark.generated(1, 2)
-@pytest.mark.parametrize("robot", robots())
+@pytest.mark.parametrize("robot", thinned(robots(), every=3))
 def test_a_long_session_keeps_every_limit_and_ends_every_goal_once(
     robot: str, seed: int, request: pytest.FixtureRequest
 ) -> None:

@@ -15,6 +15,7 @@ from _pytest.mark import ParameterSet
 from conftest import Rig, changed
 from control_rig import CONFIG
 from drivers.test_homing import incremental
+from generated import thinned
 from msgspec import structs
 from trirail.config import Config
 from trirail.control.cycle import MAX_DISTANCE_STEPS
@@ -360,7 +361,7 @@ def test_a_position_that_jumps_for_a_cycle_moves_no_setpoint(rig: Cia402Rig) -> 
 @pytest.mark.parametrize("before", ["new", "disable", "quick_stop"])
 @pytest.mark.parametrize("index", range(3))
 @pytest.mark.parametrize("metres", [0.03, -0.01])
-@pytest.mark.parametrize("cycles", [1, 2, 100])
+@pytest.mark.parametrize("cycles", thinned([1, 2, 100], every=3))
 def test_a_position_that_jumps_without_power_and_stays_is_reported_once(
     rig: Cia402Rig, before: str, index: int, metres: float, cycles: int
 ) -> None:

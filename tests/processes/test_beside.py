@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from control_rig import carried
+from generated import thinned
 from msgspec import structs
 from numpy.typing import NDArray
 from processes.test_quiet import (
@@ -100,7 +101,12 @@ def replayed(config: Config, records: NDArray[np.void], inputs: list[ControlInpu
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.parametrize(
     ("protocol", "seed"),
-    [*(("cia402", seed) for seed in range(6)), *(("odrive", seed) for seed in range(2)), ("two", 1), ("stops", 1)],
+    [
+        *thinned((("cia402", seed) for seed in range(6)), every=3),
+        *thinned(("odrive", seed) for seed in range(2)),
+        ("two", 1),
+        ("stops", 1),
+    ],
 )
 def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last_bit(
     protocol: str, seed: int, number: int, tmp_path: Path
@@ -174,7 +180,7 @@ MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
 """Events while cycles run beside a decision."""
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", thinned([2, 1]))
 @pytest.mark.parametrize("mishap", MISHAPS)
 @pytest.mark.generated(1, 2)
 def test_what_happens_beside_a_decision_is_handled_in_its_cycle(

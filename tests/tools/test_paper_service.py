@@ -12,6 +12,7 @@ import numpy as np
 import paper
 import paper_service
 import pytest
+from generated import thinned
 from paper_motions import DURATION, EXAMPLES, QUANTITIES, Example, computed, greatest_difference, platform
 from paper_service import REACHED_AFTER_CYCLES, driven, points
 from refusals import refused_as
@@ -78,7 +79,7 @@ def test_a_motion_fits_a_message_and_is_exact_at_its_points(example: Example) ->
         assert np.array_equal(np.array(rows), values)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
+@pytest.mark.parametrize("example", thinned(EXAMPLES, every=3), ids=lambda example: example.name)
 def test_the_cycle_that_takes_the_goal_is_one_period_into_it(rig: conftest.Rig, example: Example) -> None:
     """What the alignment rests on, without processes: control and driver on the simulated bus.
 
