@@ -14,9 +14,14 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from processes.test_ends import outcomes
 from trirail import Robot
 from trirail.client import own_service
+from trirail.processes.operating_system import child
+from trirail.telemetry.reading import read
+from trirail.wire.vocabulary import MODES, Mode
 
 UNIT = Path(__file__).parents[2] / "configs" / "trirail.service"
 CAN_UNIT = UNIT.with_name("trirail-can@.service")
@@ -42,7 +47,7 @@ nothing gets a real-time priority."""
 HERE = """\
 [Service]
 ExecStart=
-ExecStart={python} -P -m trirail run {config} --record {recording}
+ExecStart={python} -P -m trirail run {config}
 User=
 WorkingDirectory={folder}
 ReadWritePaths={folder} {checkout}
@@ -73,10 +78,7 @@ class Systemd:
         (units / "trirail.service.d").mkdir(parents=True)
         shutil.copy(UNIT, units)
         self.config, self.locator = own_service.private(folder)
-        self.recording = folder / "unit.rrd"
-        here = HERE.format(
-            python=sys.executable, config=self.config, recording=self.recording, folder=folder, checkout=UNIT.parents[1]
-        )
+        here = HERE.format(python=sys.executable, config=self.config, folder=folder, checkout=UNIT.parents[1])
         (units / "trirail.service.d/here.conf").write_text(here)
         self._environment = os.environ | {
             "XDG_RUNTIME_DIR": str(folder),
@@ -109,6 +111,10 @@ class Systemd:
 
     def shown(self) -> str:
         return self.ctl("show", "trirail", "-p", "ActiveState,SubState,Result,NRestarts,MainPID")
+
+    @property
+    def main_pid(self) -> int:
+        return int(self.ctl("show", "trirail", "-p", "MainPID", "--value"))
 
     def until(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + UP_WITHIN
@@ -148,6 +154,30 @@ def test_it_is_up_when_it_says_so_comes_back_disabled_and_stops_in_a_controlled_
         robot.move_to(x=0.02, y=0.0, phi=0.0)
         systemd.ctl("stop", "trirail")
     assert systemd.shows(ActiveState="inactive", Result="success")(), systemd.ctl("status", "trirail")
+
+
+def score(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/oom_score_adj").read_text())
+
+
+@pytest.mark.parametrize("harm", ["KILL", "STOP"])
+def test_the_loop_stops_the_robot_when_the_supervisor_is_lost(systemd: Systemd, harm: str) -> None:
+    """A stopped supervisor is lost when the watchdog says so; what it has started is not killed with it."""
+    (systemd.folder / "units/trirail.service.d/watchdog.conf").write_text("[Service]\nWatchdogSec=3\n")
+    systemd.ctl("daemon-reload")
+    systemd.ctl("start", "trirail")
+    with Robot("demo", systemd.locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.15, y=0.0, phi=0.0, speed=0.03)
+        scores = {name: score(child(systemd.main_pid, name)) for name in ("loop", "gateway", "recorder")}
+        assert scores["recorder"] > scores["loop"] == scores["gateway"], "memory runs out: the recorder ends first"
+        systemd.ctl("kill", "--kill-whom=main", f"--signal={harm}", "trirail")
+    systemd.until(systemd.shows(ActiveState="active", NRestarts="1"))
+    recorded = read(min(systemd.folder.rglob("*.rrd"), key=lambda file: file.stat().st_ctime_ns))
+    records = recorded.records
+    assert outcomes(recorded)[0][1] == "stopped"
+    assert MODES[records["mode"][-1]] is Mode.DISABLED
+    assert np.abs(records["commanded_velocity"][-1]).max() == 0.0
 
 
 def test_the_can_interface_comes_up_with_bitrate_and_queue(systemd: Systemd) -> None:

@@ -41,17 +41,20 @@ WITH_PARENT: Final = {"loop": signal.SIGTERM, "drives": signal.SIGTERM, "planner
 Gateway and recorder receive no signal. They end by themselves after the loop, once the loop's last messages have been
 published and written to disk.
 """
-TERMINAL_SIGNALS: Final = (
+SUPERVISOR_SIGNALS: Final = (
     signal.SIGINT,
     signal.SIGQUIT,
     signal.SIGHUP,
     signal.SIGTSTP,
     signal.SIGTTIN,
     signal.SIGTTOU,
+    signal.SIGABRT,
 )
-"""Signals that a terminal sends to all of its processes.
+"""Signals for the supervisor alone. Its children ignore them, and notice the end of the supervisor by themselves.
 
-It sends them on Ctrl-C, Ctrl-\\ and Ctrl-Z, when it is closed, and when a process in the background uses it.
+A terminal sends all but the last to all of its processes: on Ctrl-C, Ctrl-\\ and Ctrl-Z, when it is closed, and when a
+process in the background uses it. systemd sends SIGINT to all processes of a service to end it, also when the
+supervisor has died, and SIGABRT when the supervisor no longer feeds the watchdog.
 """
 ALLOCATOR_ENVIRONMENT: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
 """Environment for Rerun's allocator, so that it does not reserve memory in advance."""
@@ -251,8 +254,8 @@ def serve(inheritance: Inheritance, work: Callable[[Child], int] = run) -> None:
     """Run the fork server until the supervisor disconnects."""
     name_process("fork-server")
     die_with_parent(signal.SIGKILL)
-    # Only the supervisor reacts to a terminal's signals. A SIGTERM stays pending until a child unblocks it.
-    for number in TERMINAL_SIGNALS:
+    # A SIGTERM stays pending until a child unblocks it.
+    for number in SUPERVISOR_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, [signal.SIGTERM])

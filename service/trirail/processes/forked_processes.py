@@ -20,7 +20,7 @@ from trirail.processes.child_process import COMPILING, HAPPENED, MEASURED
 from trirail.processes.fork_server import (
     MATHEMATICS,
     MAX_PACKET_BYTES,
-    TERMINAL_SIGNALS,
+    SUPERVISOR_SIGNALS,
     ChildEnd,
     ChildStart,
     Fork,
@@ -71,7 +71,7 @@ class ForkServerLink:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setblocking(False)
         # Blocked during the fork, so that a terminal's signals cannot end the fork server before it ignores them.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SUPERVISOR_SIGNALS)
         with theirs:
             self._process = ServerProcess(Inheritance(theirs, order, runtime, heartbeats, sockets))
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)

@@ -10,6 +10,7 @@ import gc
 import os
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from setproctitle import setproctitle
@@ -56,7 +57,11 @@ def release_startup_memory() -> None:
 def _clean() -> Iterator[tuple[int, int]]:
     """Yield the address range of each mapping of a library that is read-only and has no private pages."""
     path, rights, start, end = "", "", 0, 0
-    for line in Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines():
+    try:
+        mappings = Path("/proc/self/smaps").read_text(encoding="utf-8", errors="surrogateescape")
+    except OSError:  # the kernel has no smaps, so that nothing can be released
+        return
+    for line in mappings.splitlines():
         first, *rest = line.split()
         if not first.endswith(":"):
             start, end = (int(address, 16) for address in first.split("-"))
@@ -86,6 +91,12 @@ def _call(name: str, *arguments: int) -> None:
 def die_with_parent(signal_number: int) -> None:
     """Make the kernel send a signal to this process when the parent process ends."""
     _call("prctl", _PR_SET_PDEATHSIG, signal_number)
+
+
+def offer_to_oom_killer() -> None:
+    """Make the kernel end this process before the other processes of the service, if memory runs out."""
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
 
 
 def name_process(name: str) -> None:

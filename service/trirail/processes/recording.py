@@ -18,7 +18,7 @@ from trirail.config import Config
 from trirail.processes.heartbeats import Heart
 from trirail.processes.loop_death import LoopDeath
 from trirail.processes.monitoring import MEASUREMENT_PERIOD_S, RecorderMeasurements
-from trirail.processes.realtime import release_startup_memory
+from trirail.processes.realtime import offer_to_oom_killer, release_startup_memory
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
@@ -164,6 +164,7 @@ def main(
 
     `report_measurements` is called once per second, if the configuration enables metrics.
     """
+    offer_to_oom_killer()  # a recorder that has ended is restarted, and the robot moves on
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
     intake = Intake(config, record, link, ready)
     release_startup_memory()

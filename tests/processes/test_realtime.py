@@ -1,0 +1,32 @@
+"""What a process asks of the system for itself."""
+
+from __future__ import annotations
+
+import _ctypes
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from trirail.processes import realtime
+
+
+def test_memory_is_released_whatever_the_folders_of_libraries_are_called(tmp_path: Path) -> None:
+    folder = os.fsencode(tmp_path) + b"/caf\xe9"
+    os.mkdir(folder)
+    library = os.fsdecode(folder + b"/loaded.so")
+    shutil.copy(_ctypes.__file__, library)
+    load = f"import ctypes; ctypes.CDLL({library!r}); from trirail.processes import realtime; "
+    code = f"{load}realtime.release_startup_memory(); print(ctypes.CDLL({library!r})._name.count('caf'))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("1\n", "")
+
+
+def test_memory_is_released_as_far_as_the_kernel_tells_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_smaps(_: Path, **_more: object) -> str:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(Path, "read_text", no_smaps)
+    realtime.release_startup_memory()
