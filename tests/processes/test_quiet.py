@@ -30,7 +30,7 @@ from trirail.config import Config
 from trirail.motion.motion_planner import MotionPlanner
 from trirail.motion.runs import Run
 from trirail.motion.schedule import Schedule
-from trirail.processes.clock import Ticker
+from trirail.processes.clock import Suspensions, Ticker
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.loop import Loop
 from trirail.processes.ports import Ports
@@ -88,6 +88,8 @@ class Session:
         self.now_ns = self.begins_ns
         self.config = config
         self.folder = folder
+        self.asleep_s = 0.0
+        """How long the computer has been suspended."""
         self.late_ns = 0
         """By how much the next tick comes late."""
         self.room: int | None = None
@@ -117,7 +119,9 @@ class Session:
             self._stack.callback(closes.close)
         self.hearts = Heartbeats.create()
         self.motion = MotionPlanner(config)
-        self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet, now=lambda: self.now_ns)
+        suspensions = Suspensions(lambda: self.asleep_s)
+        clocks: dict[str, Any] = {"suspensions": suspensions, "now": lambda: self.now_ns}
+        self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet, **clocks)
         self.loop.begin()
         self.ticker = Ticker(round(config.period * 1e9), lambda: self.now_ns, self.sleep)
         self.heard: list[object] = []
@@ -779,6 +783,33 @@ def test_a_position_that_jumps_without_power_is_reported_alike_and_once(protocol
     jump = Happening(partial(_push, slider=1, by=0.02))
     session = both_ways(CONFIGS[protocol], tmp_path, lambda: {200: [jump]}, 400)
     assert sum("its position has jumped" in repr(each) for each in session.heard) == 1
+
+
+@pytest.mark.generated(*range(6))
+def test_a_computer_that_was_suspended_does_not_move_on(seed: int, tmp_path: Path) -> None:
+    """Nobody may be there any more. What is too short to be one is none, and each is told once."""
+    chance = random.Random(seed)
+    slept, at = chance.uniform(0.2, 1e5), chance.randrange(340, 700)
+    requests: dict[int, Request] = {
+        30: CommandRequest(1, "ann", Command.ENABLE),
+        330: GoalRequest(2, "ann", "one", PoseGoal(0.05, 0.01, 0.1, speed=0.1, blend=0.005), 0),
+        331: GoalRequest(3, "ann", "other", PoseGoal(-0.02, 0.0, 0.0), 0),
+    }
+    happens = {number: [Happening(partial(Session.ask, request=each))] for number, each in requests.items()}
+    for number, seconds in ((310, 0.09), (at, slept)):
+        happens[number] = [Happening(partial(_sleep, seconds=seconds))]
+    one = both_ways(CONFIGS["cia402"], tmp_path, lambda: happens, 1000)
+    events = [each for each in one.heard if isinstance(each, tuple) and len(each) == 6]
+    (suspended,) = (each for each in events if each[3] == "service" and "suspended" in each[4])
+    assert suspended[4] == f"the computer was suspended for {slept:.1f} s: the robot stops"
+    assert at <= suspended[1] <= at + 2
+    assert [outcome for _, cycle, *_, outcome in events if outcome and cycle >= at] == ["stopped", "stopped"]
+    assert one.loop.control.state.mode is Mode.HOLDING
+    assert one.loop.control.fault is None
+
+
+def _sleep(session: Session, seconds: float) -> None:
+    session.asleep_s += seconds
 
 
 def _push(session: Session, slider: int, by: float) -> None:

@@ -33,6 +33,8 @@ _INTERRUPTED: Final = 4
 """EINTR of errno.h."""
 _POLLIN: Final = 1
 _SECOND: Final = 1_000_000_000
+MIN_SUSPENSION_S: Final = 0.1
+"""Shortest suspension of the computer that is detected [s]."""
 
 
 @compiled()
@@ -141,6 +143,39 @@ class Overruns:
             return 0
         in_a_row, self.in_a_row = self.in_a_row, 0
         return in_a_row
+
+
+def asleep_s() -> float:
+    """Return how long the computer has been suspended since it was booted, or slightly less [s]."""
+    booted_for = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return booted_for - time.monotonic()
+
+
+class Suspensions:
+    """Detector of suspensions of the computer.
+
+    The monotonic clock does not count the time in which the computer is suspended, so no tick is late afterwards.
+    `asleep_s` returns the sum of these times since the computer was booted [s].
+    """
+
+    def __init__(self, asleep_s: Callable[[], float] = asleep_s) -> None:
+        self._asleep_s = asleep_s
+        self._known_s = asleep_s()
+        self._suspended_s = 0.0
+
+    def occurred(self) -> bool:
+        """Return True if the computer has been suspended since `pop_duration` was called last."""
+        asleep_s = self._asleep_s()
+        if asleep_s > self._known_s + MIN_SUSPENSION_S:
+            self._suspended_s += asleep_s - self._known_s
+        self._known_s = max(self._known_s, asleep_s)
+        return self._suspended_s > 0.0
+
+    def pop_duration(self) -> float:
+        """Return the duration of the suspensions since the last call [s]; 0 if there were none."""
+        self.occurred()
+        suspended_s, self._suspended_s = self._suspended_s, 0.0
+        return suspended_s
 
 
 def sleep_until(deadline_ns: int, busy_wait_ns: int = 0) -> None:

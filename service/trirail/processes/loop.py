@@ -13,7 +13,7 @@ from trirail_drivers.interface import NAMES, DriveFault, DriveGroup, Feedback
 from trirail.config import Config
 from trirail.control.control import Control, TimedInput
 from trirail.control.modes import ModeEvent
-from trirail.processes.clock import Overruns, PollSet, Tick, Ticker
+from trirail.processes.clock import Overruns, PollSet, Suspensions, Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
 from trirail.processes.quiet import MOST_AHEAD, Reached
@@ -80,6 +80,7 @@ class Loop:
         capture: Capture | None = None,
         lacking: tuple[str, ...] = (),
         quiet: bool = True,
+        suspensions: Suspensions | None = None,
         now: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Create and connect the parts of the loop.
@@ -90,11 +91,14 @@ class Loop:
             Real-time rights that the loop could not acquire, which it reports in its welcome.
         quiet
             True if the compiled call runs the cycles without events, False if Python runs every cycle.
+        suspensions
+            Detector of suspensions of the computer; None for one with the computer's own clocks.
         now
             Clock with which the duration of decisions is measured [ns].
 
         """
         self._now = now
+        self._suspensions = suspensions or Suspensions()
         self._drives = drives
         patience = max(MIN_GATEWAY_TIMEOUT_CYCLES, round(config.watchdogs.gateway_timeout * config.loop.rate_hz))
         watch = Watch(heartbeats.heart("gateway"), patience)
@@ -148,7 +152,7 @@ class Loop:
     def turn(self, ticker: Ticker) -> None:
         """Run cycles without events in compiled code, or one cycle with an event in Python; then handle requests."""
         quiet, newest = self._quiet, None
-        disturbed = self.ending or self._gateway.frozen or not self._planner.idle
+        disturbed = self.ending or self._gateway.frozen or not self._planner.idle or self._suspensions.occurred()
         if quiet is not None and not disturbed:
             work, self._work = self._work, None
             newest = quiet.run(ticker, self._overruns, self._decision_budget.ns + HANDOVER_NS, work)
@@ -376,7 +380,7 @@ class Loop:
         self._marked_ns = now
 
     def _watch(self, tick: Tick, feedback: Feedback) -> Iterator[Disturbance]:
-        """Yield a disturbance for late ticks, for a lost gateway and for a request to end the service.
+        """Yield a disturbance for late ticks, a suspension, a lost gateway and a request to end the service.
 
         Also note changes of the drives' fault and readiness for the recorder.
         """
@@ -391,6 +395,10 @@ class Loop:
             words = f"{in_a_row} ticks missed in a row: the machine is too busy"
             late = coded(words, EventCode.MACHINE_BUSY, ticks=in_a_row)
             yield Disturbance(ModeEvent.LATE.name, late.text, **late.fields)
+        if suspended_s := self._suspensions.pop_duration():
+            words = f"the computer was suspended for {suspended_s:.1f} s: the robot stops"
+            suspended = coded(words, EventCode.SUSPENDED, duration=suspended_s)
+            yield Disturbance(ModeEvent.LATE.name, suspended.text, **suspended.fields)
         if (lost := self._gateway.lost()) is not None:
             yield Disturbance(ModeEvent.GATEWAY_LOST.name, lost.text, **lost.fields)
         if self.ending and (self._ending_since is None or self.control.state.mode in _STILL_IN_USE):

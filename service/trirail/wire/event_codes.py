@@ -61,6 +61,7 @@ class EventCode(StrEnum):
     LOOP_DIED = "loop_died", "the loop's process has died"
     LOOP_FROZEN = "loop_frozen", "the loop's process hung and was killed"
     INTERNAL_ERROR = "internal_error", "an error of the service's own", "error"
+    SUSPENDED = "suspended", "the computer was suspended, and the robot has stopped", "duration"
     MACHINE_BUSY = "machine_busy", "the loop missed ticks in a row", "ticks"
     GATEWAY_LOST = "gateway_lost", "the gateway's process has died"
     GATEWAY_FROZEN = "gateway_frozen", "the gateway's process hangs", "timeout"
