@@ -323,6 +323,9 @@ while True:  # asks, and is stopped in the middle of it
             robot.stop()
         for _ in itertools.islice(robot.states(2.0), 20):
             pass
+    # Later, each connection that times out blocks one of these for 10 s.
+    names = [task.read_text() for task in Path(f"/proc/{service.child('gateway')}/task").glob("*/comm")]
+    assert sum(name.startswith("rx-") for name in names) >= 8, names
 
 
 # ---------------------------------------------------------------------- what strangers publish

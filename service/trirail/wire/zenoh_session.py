@@ -28,6 +28,12 @@ BATCH_SIZE = 8192
 
 Zenoh uses the smaller of the sizes that the two sides of a connection propose."""
 
+_RUNTIME = "(rx: (worker_threads: 8))"
+"""Threads with which a service's Zenoh handles received messages, unless ZENOH_RUNTIME is set.
+
+When a connection to a frozen client times out, Zenoh blocks one of these threads for 10 s. It has two by default, so
+that two frozen clients would delay the messages of all others.
+"""
 _COMMON_SETTINGS = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
@@ -60,6 +66,7 @@ def open_service(
                 f"cannot listen on {file}: this file exists and is not a socket; move it away, or change zenoh.listen"
             )
     settings = {"mode": "peer", **serving(listen, credentials, access_control, connect)}
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # Zenoh reads it when the first session of the process opens
     return _open(
         settings,
         f"cannot listen on {', '.join(listen)}",
