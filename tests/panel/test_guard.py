@@ -279,7 +279,6 @@ def test_a_port_that_is_taken_is_told() -> None:
     "message",
     [
         b"",
-        b"\xff",
         b"[" * 3000,
         b'{"do": "fly"}',
         b'{"do": "hold"}',
@@ -296,7 +295,7 @@ def test_a_port_that_is_taken_is_told() -> None:
 )
 def test_what_is_no_message_is_refused_and_the_tab_goes_on(panel: Panel, message: bytes) -> None:
     with connect(socket_of(panel), legacy=True) as opened:
-        opened.send(message)
+        opened.send(message, text=True)
         opened.send('{"do": "command", "name": "pause"}')
         said: list[str] = []
         while not said or "done" not in said[-1]:
@@ -380,12 +379,11 @@ def test_the_last_override_counts_however_slow_the_answers_are() -> None:
         assert robot.commands == ["override", "pause", "override"]
 
 
-POINTS = "t,x,y,phi\n0,0.01,0.005,0.1\n1,0.011,0.005,0.1\n"
 MOVING: list[dict[str, Any]] = [
     {"do": "goal", "goal": {"kind": "move", "x": 0.001, "y": 0.0, "phi": 0.0}},
     {"do": "goal", "goal": {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}},
     {"do": "goal", "goal": {"kind": "named", "name": "park"}},
-    {"do": "follow", "name": "path.csv", "text": POINTS},
+    {"do": "follow", "file": 0},
     *({"do": "command", "name": name} for name in ("enable", "home", "resume")),
     {"do": "command", "name": "override", "content": {"percent": 50.0}},
     {"do": "command", "name": "set_output", "content": {"output": "valve", "value": True}},
@@ -408,7 +406,7 @@ def replies(panel: Panel, robot: FakeRobot, messages: list[dict[str, Any]], age_
     return found
 
 
-@pytest.mark.parametrize("message", MOVING, ids=lambda message: str(message.get("name") or message["goal"]["kind"]))
+@pytest.mark.parametrize("message", MOVING, ids=lambda message: str(message.get("name") or message["do"]))
 def test_what_can_move_the_robot_is_refused_with_words_where_the_page_is_late(message: dict[str, Any]) -> None:
     """So is a press that a slow connection has held up. A stop is sent however late it is."""
     robot = FakeRobot()

@@ -27,7 +27,7 @@ MAY: dict[Role | None, set[str]] = {
     Role.MAINTAINER: MAINTAINER | {"stop"},
 }
 """Once more, by hand."""
-PATH = "t,x,y,phi\n0,0.01,0.005,0.1\n1,0.011,0.005,0.1\n"
+PATH = b"t,x,y,phi\n0,0.01,0.005,0.1\n1,0.011,0.005,0.1\n"
 ACTIONS: list[tuple[str, dict[str, Any]]] = [
     *(
         (name, {"do": "command", "name": name, "seen": 10**15})
@@ -44,7 +44,7 @@ ACTIONS: list[tuple[str, dict[str, Any]]] = [
     ("goal", {"do": "goal", "goal": {"kind": "move", "x": 0.001, "y": 0.0, "phi": 0.0}, "seen": 10**15}),
     ("goal", {"do": "goal", "goal": {"kind": "named", "name": "park"}, "seen": 10**15}),
     ("goal", {"do": "goal", "goal": {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}, "seen": 10**15}),
-    ("goal", {"do": "follow", "name": "path.csv", "text": PATH, "seen": 10**15}),
+    ("goal", {"do": "follow", "file": 1, "seen": 10**15}),
     ("poses", {"do": "teach", "name": "here"}),
     ("poses", {"do": "forget", "name": "park"}),
 ]
@@ -75,7 +75,9 @@ def test_what_a_role_may_not_reaches_no_robot(
         Panel(robot.robot(), 0) as panel,
         connect(f"{panel.url.replace('http', 'ws')}socket", legacy=True) as opened,
     ):
-        opened.send(msgspec.json.encode(message))
+        opened.send(msgspec.json.encode({"do": "upload", "file": 1, "name": "path.csv", "size": len(PATH)}).decode())
+        opened.send(PATH)
+        opened.send(msgspec.json.encode(message).decode())
         if message["do"] == "hold" and needs in MAY[role]:
             while not robot.sent:
                 opened.recv(WITHIN)

@@ -19,8 +19,6 @@ from trirail.wire.vocabulary import Command, Override
 
 MOVING_COMMANDS = frozenset({Command.ENABLE, Command.HOME, Command.RESUME, Command.OVERRIDE, Command.SET_OUTPUT})
 """Commands that can cause motion or switch on power."""
-Content = Annotated[str, Meta(max_length=MAX_FILE)]
-"""Content of a trajectory file."""
 
 
 class _PageMessage(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
@@ -110,13 +108,26 @@ class CheckPose(_PageMessage, frozen=True, tag="check"):
     """Number by which the page matches the answer to the request."""
 
 
+class BeginUpload(_PageMessage, frozen=True, tag="upload"):
+    """Announcement of a trajectory file, which replaces the tab's previous file.
+
+    The page then sends the content as binary messages. The server acknowledges this message and each part, and the
+    page sends the next part only after the acknowledgement. A stop therefore waits for at most one part.
+    """
+
+    file: int
+    """Number by which the page refers to the file."""
+    name: str
+    """Name of the file. The suffix .json means JSON; every other suffix means CSV."""
+    size: Annotated[int, Meta(ge=0, le=MAX_FILE)]
+    """Size of the file [bytes]."""
+
+
 class CheckPath(_PageMessage, frozen=True, tag="check path"):
     """Request to check, without moving, if the path in a file can be followed."""
 
-    name: str
-    """Name of the file. The suffix .json means JSON; every other suffix means CSV."""
-    text: Content
-    """Content of the file."""
+    file: int
+    """Number of the uploaded file."""
     number: int
     """Number by which the page matches the answer to the request."""
     stretch: bool = False
@@ -128,10 +139,8 @@ class Follow(_PageMessage, frozen=True, tag="follow"):
 
     permission = GOAL
 
-    name: str
-    """Name of the file, as in CheckPath."""
-    text: Content
-    """Content of the file."""
+    file: int
+    """Number of the uploaded file."""
     seen: int
     """Stamp of the newest state that the page has drawn. The server refuses the path if this state is outdated."""
     stretch: bool = False
@@ -158,4 +167,4 @@ class Forget(_PageMessage, frozen=True, tag="forget"):
 
 ServiceRequest = SendCommand | TakeOver | SendGoal | Follow | Teach | Forget
 """Requests that the server passes on to the service, except jogs."""
-AnyPageMessage = StateDrawn | JogHeld | JogReleased | CheckPose | CheckPath | ServiceRequest
+AnyPageMessage = StateDrawn | JogHeld | JogReleased | CheckPose | BeginUpload | CheckPath | ServiceRequest

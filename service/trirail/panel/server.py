@@ -27,7 +27,6 @@ from trirail.panel.connections import Connections
 from trirail.panel.feed import Feed
 from trirail.panel.recordings import Recordings
 from trirail.panel.tab import Tab
-from trirail.wire.sizes import MAX_FILE
 
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """Accepted names in the Host header. A browser sends another name for a malicious page with a host name that resolves
@@ -60,8 +59,8 @@ PORT = 9880
 """Default port of the page, which is used if it is free and no other port is requested."""
 SOCKET = "socket"
 """Name after the token in the path of the page's WebSocket."""
-MAX_MESSAGE = 3 * MAX_FILE
-"""Maximum size of a message from the page, which may contain a trajectory file as a JSON string [bytes]."""
+MAX_MESSAGE = 65_536
+"""Maximum size of a message from the page, such as a part of a trajectory file [bytes]."""
 LANGUAGES = "languages.json"
 """Name of the file with the languages of the page: the code of each language, and its name in the same language."""
 SESSIONS, RECORDING, REPORT = "sessions", "recording", "report"

@@ -17,8 +17,18 @@ from trirail.client.blocking import GoalHandle, LoopThread
 from trirail.client.held_jog import HeldJog
 from trirail.errors import RefusalCode
 from trirail.panel.feed import Feed
-from trirail.panel.messages import AnyPageMessage, CheckPath, CheckPose, JogHeld, JogReleased, SendCommand, StateDrawn
+from trirail.panel.messages import (
+    AnyPageMessage,
+    BeginUpload,
+    CheckPath,
+    CheckPose,
+    JogHeld,
+    JogReleased,
+    SendCommand,
+    StateDrawn,
+)
 from trirail.panel.tab_requests import OUTDATED, TabRequests, is_fresh, refusal
+from trirail.panel.uploads import UploadedFile, Uploads
 from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.goals import Goal
 
@@ -88,7 +98,8 @@ class Tab:
         """Whether a jog was refused because of an outdated state. It stays refused until the button is released."""
         self._outbox: deque[bytes] = deque(maxlen=MAX_ANSWERS)
         self._undrawn: deque[int] = deque()
-        self._requests = TabRequests(robot, loop, self._enqueue)
+        self._uploads = Uploads()
+        self._requests = TabRequests(robot, loop, self._enqueue, self._uploads)
         self._poses, self._paths = NewestTask("pose check"), NewestTask("path check")
         self._open = True
 
@@ -98,8 +109,11 @@ class Tab:
         sender.start()
         try:
             with contextlib.suppress(ConnectionClosed):  # the tab was closed or killed, or has sent too much
-                for text in self._socket:
-                    self._on_message(text)
+                for content in self._socket:
+                    if isinstance(content, bytes):
+                        self._on_part(content)
+                    else:
+                        self._on_message(content)
         finally:
             self._jog.close()
             self._poses.close()
@@ -109,13 +123,17 @@ class Tab:
                 self._feed.changed.notify_all()
             self._requests.close()
 
-    def _on_message(self, text: str | bytes) -> None:
+    def _on_part(self, part: bytes) -> None:
+        try:
+            self._enqueue("received", **self._uploads.append(part))
+        except ValueError as error:
+            self._refuse_message(str(error))
+
+    def _on_message(self, text: str) -> None:
         try:
             message: AnyPageMessage = decoded(text, AnyPageMessage)
         except INVALID as error:
-            self._enqueue(
-                "refused", to="page", message=f"not a message of this page: {error}", code=RefusalCode.MALFORMED
-            )
+            self._refuse_message(f"not a message of this page: {error}")
             return
         if message.required_permission is not None and message.required_permission not in self._feed.permissions:
             words = f"your role does not allow {message.required_permission}"
@@ -127,23 +145,28 @@ class Tab:
                     while self._undrawn and self._undrawn[0] <= stamp:
                         self._undrawn.popleft()
                     self._feed.changed.notify_all()
-            case JogHeld(velocity, seen, tool):
-                if not is_fresh(seen) and not self._jog_refused:
-                    self._jog_refused = True
-                    self._enqueue("ended", **OUTDATED)
-                if not self._jog_refused:
-                    self._jog.hold(velocity, tool)
+            case JogHeld():
+                self._hold_jog(message)
             case JogReleased():
                 self._jog_refused = False
                 self._jog.release()
             case CheckPose():
                 self._poses.submit(lambda: self._check_pose(message))
+            case BeginUpload():
+                self._enqueue("received", **self._uploads.begin(message))
             case CheckPath():
-                self._paths.submit(lambda: self._check_path(message))
+                self._check_path(message)
             case _:
                 if isinstance(message, SendCommand) and message.name.stops:
                     self._jog.release()
                 self._requests.begin(message)
+
+    def _hold_jog(self, message: JogHeld) -> None:
+        if not is_fresh(message.seen) and not self._jog_refused:
+            self._jog_refused = True
+            self._enqueue("ended", **OUTDATED)
+        if not self._jog_refused:
+            self._jog.hold(message.velocity, message.tool)
 
     def _send_goal(self, make: Callable[[str], Goal], goal_id: str) -> GoalHandle:
         goal = self._loop.call(self._robot.send(make, goal_id))
@@ -157,10 +180,19 @@ class Tab:
         self._enqueue("checked", number=message.number, obstacle=self._feed.find_obstacle(message.goal))
 
     def _check_path(self, message: CheckPath) -> None:
-        result = self._feed.check_path(message.name, message.text, message.stretch)
-        self._enqueue("path", number=message.number, found=result)
+        def check(file: UploadedFile) -> None:
+            result = self._feed.check_path(file.name, file.text, message.stretch)
+            self._enqueue("path", number=message.number, found=result)
+
+        if file := self._uploads.find(message.file):
+            self._paths.submit(lambda: check(file))
+        else:
+            self._refuse_message(f"file {message.file}: not uploaded")
 
     # ------------------------------------------------------------------ output
+
+    def _refuse_message(self, why: str) -> None:
+        self._enqueue("refused", to="page", message=why, code=RefusalCode.MALFORMED)
 
     def _enqueue(self, tell: str, /, **content: Any) -> None:
         with self._feed.changed:

@@ -17,6 +17,7 @@ from trirail.client.lease import AsyncLease
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.panel.feed import now
 from trirail.panel.messages import Follow, Forget, SendCommand, SendGoal, ServiceRequest, TakeOver, Teach
+from trirail.panel.uploads import UploadedFile, Uploads
 from trirail.wire.goals import kind_name
 from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import Command
@@ -46,13 +47,14 @@ class MessageSender(Protocol):
 class TabRequests:
     """Sender of the requests of one tab, and holder of the tab's lease.
 
-    `send` is a function that sends the results of the requests to the page.
+    `send` is a function that sends the results of the requests to the page. `uploads` contains the tab's file.
     """
 
-    def __init__(self, robot: AsyncRobot, loop: LoopThread, send: MessageSender) -> None:
+    def __init__(self, robot: AsyncRobot, loop: LoopThread, send: MessageSender, uploads: Uploads) -> None:
         self._robot = robot
         self._loop = loop
         self._reply = send
+        self._uploads = uploads
         self._pending: Counter[str] = Counter()
         self._lease: AsyncLease | None = None
         self._acquiring = asyncio.Lock()
@@ -85,8 +87,9 @@ class TabRequests:
                 self._loop.start(self._answer(lambda: self._acquire(force=True), "takeover"))
             case SendGoal(goal, seen):
                 self._begin_motion(lambda: self._robot.send(goal), seen, kind_name(goal), getattr(goal, "name", ""))
-            case Follow(name, _, seen):
-                self._begin_motion(lambda: self._follow(request), seen, "follow", name)
+            case Follow(number, seen, stretch):
+                file = self._uploads.find(number)
+                self._begin_motion(lambda: self._follow(file, stretch), seen, "follow", file.name if file else "")
             case Teach(name):
                 self._loop.start(self._answer(lambda: self._robot.teach(name), "teach", name))
             case Forget(name):
@@ -144,9 +147,11 @@ class TabRequests:
                     return None
         return await self._robot.command(name, content)
 
-    async def _follow(self, request: Follow) -> AsyncGoalHandle:
-        points = await asyncio.to_thread(trajectory.parse, request.name, request.text)
-        return await self._robot.follow(points, stretch=request.stretch)
+    async def _follow(self, file: UploadedFile | None, stretch: bool) -> AsyncGoalHandle:
+        if file is None:
+            raise RefusedError(RefusalCode.MALFORMED, "the file has not been uploaded")
+        points = await asyncio.to_thread(lambda: trajectory.parse(file.name, file.text))
+        return await self._robot.follow(points, stretch=stretch)
 
     async def _acquire(self, *, force: bool = False) -> None:
         """Acquire the lease, and renew it until this tab closes."""

@@ -1,19 +1,25 @@
-// Following a path in a file: checked and drawn when it is chosen, followed when it is told, and how far it is meanwhile.
+// Following a path in a file: sent to the server once, in parts; checked and drawn when it is chosen, followed when it is
+// told, and how far it is meanwhile.
 
 import { refusal } from "./service_words.js";
 import { rounded } from "./units.js";
 import { number, onLanguage, say } from "./words.js";
 
+const PART = 8192; // so much of a file is sent before the server's answer [bytes]: a STOP waits for no more
+
 const byId = (id) => document.getElementById(id);
 
 export class Following {
-  // `send` says a message to the server; `now()` has the robot and its drawing; `allow` looks anew what may be pressed.
-  constructor(send, now, allow, answer, speed) {
+  // `send` says a message to the server, `sendPart` bytes of the file; `now()` has the robot and its drawing; `allow`
+  // looks anew what may be pressed.
+  constructor(send, sendPart, now, allow, answer, speed) {
     this.send = send;
+    this.sendPart = sendPart;
     this.now = now;
     this.allow = allow;
-    this.number = 0;
-    this.file = null; // name and text of what is chosen
+    this.number = 0; // of the last file, or check
+    this.file = null; // number, name and bytes of what is chosen
+    this.complete = false; // whether the server has it
     this.found = null; // what the server says of it
     this.goal = null; // its goal's id, while it is under way
     byId("choose-file").addEventListener("click", () => byId("file").click());
@@ -32,7 +38,7 @@ export class Following {
     byId("following").addEventListener("submit", (event) => {
       event.preventDefault();
       answer(say("do.follow", this.file));
-      send({ do: "follow", ...this.file, stretch: byId("stretch").checked });
+      send({ do: "follow", file: this.file.number, stretch: byId("stretch").checked });
     });
     onLanguage(() => this.#show());
   }
@@ -46,6 +52,25 @@ export class Following {
   // Whether there is a path that can be followed.
   get may() {
     return this.found !== null && !this.found.why;
+  }
+
+  // Send the file to a server that does not have it.
+  upload() {
+    if (!this.file) return;
+    const { number: file, name, bytes } = this.file;
+    this.complete = false;
+    this.found = null;
+    this.send({ do: "upload", file, name, size: bytes.length });
+    this.#show();
+  }
+
+  // The server has so much of the file.
+  received({ file, size }) {
+    if (file !== this.file?.number) return;
+    const { bytes } = this.file;
+    if (size < bytes.length) return this.sendPart(bytes.subarray(size, size + PART));
+    this.complete = true;
+    this.#check();
   }
 
   // The server says what the file comes to.
@@ -85,18 +110,21 @@ export class Following {
     byId("file").value = ""; // so that the same one can be chosen again, when it has been changed
     if (!file) return;
     this.file = this.found = null;
+    const number = ++this.number;
     if (file.size > this.now().robot.largest_file) {
       byId("file-says").textContent = say("file.large", file);
       return this.draw();
     }
-    this.file = { name: file.name, text: await file.text() };
-    this.#check();
+    const bytes = new Uint8Array(await file.arrayBuffer());
+    if (number !== this.number) return; // another one has been chosen meanwhile
+    this.file = { number, name: file.name, bytes };
+    this.upload();
   }
 
   #check() {
-    if (!this.file) return;
+    if (!this.file || !this.complete) return;
     this.found = null;
-    this.send({ do: "check path", ...this.file, stretch: byId("stretch").checked, number: ++this.number });
+    this.send({ do: "check path", file: this.file.number, stretch: byId("stretch").checked, number: ++this.number });
     this.#show();
   }
 

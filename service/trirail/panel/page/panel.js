@@ -46,7 +46,7 @@ const commands = new Commands(send, now, answer, note);
 const jogging = new Jogging(send, now, answer, note, stop);
 const speed = () => jogging.speed;
 const going = new Going(send, now, answer, speed);
-const following = new Following(send, now, allow, answer, speed);
+const following = new Following(send, sendPart, now, allow, answer, speed);
 const naming = new Naming(send, allow, answer, speed, note);
 const outputs = new Outputs(send, answer);
 const sessions = new Sessions(now);
@@ -60,6 +60,11 @@ function send(message) {
   else if (socket) note(say("not_sent"));
 }
 
+// A part of a file, which is no JSON.
+function sendPart(bytes) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(bytes);
+}
+
 function stop() {
   jogging.end();
   answer(say("do.stop"));
@@ -68,6 +73,7 @@ function stop() {
 
 function connect() {
   socket = new WebSocket(new URL("socket", location.href.replace(/^http/, "ws")));
+  socket.onopen = () => following.upload();
   socket.onmessage = (event) => take(JSON.parse(event.data));
   socket.onclose = () => {
     lost("panel");
@@ -131,6 +137,9 @@ const takes = {
   },
   checked(said) {
     going.checked(said);
+  },
+  received(said) {
+    following.received(said);
   },
   path(said) {
     following.checked(said);
