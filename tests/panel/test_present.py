@@ -10,12 +10,13 @@ import pytest
 from chromium import Page, needs_chromium
 from panel.conftest import SHOWN
 from panel.fake_robot import FakeRobot
+from panel.test_gamepad import settle
 from panel.test_page import moves, small, stands, typed
 from trirail.errors import RefusalCode, RefusedError
 from trirail.panel import tab_requests
 from trirail.panel.server import Panel
 from trirail.wire.state import GoalState, Pose
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, Mode, Role
 from waiting import wait_until
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
@@ -177,6 +178,67 @@ def test_every_disabled_control_has_its_reason_in_every_state(enabled: Page, rob
         may = mode in (Mode.HOLDING, Mode.MOVING) or (mode is Mode.STOPPING and goal is not None)
         may = may and (holder == "ann" or (holder is None and policy == "optional"))
         assert enabled.evaluate("!document.querySelector('.hold').disabled") == may, (mode, holder, goal)
+
+
+def change(page: Page, robot: FakeRobot, what: str, there: bool) -> None:
+    """Take from the page what a control needs, or give it back."""
+    if what == "lease":
+        robot.holder = None if there else "bob"
+        return
+    robot.silent.set()
+    page.until("document.body.dataset.contact === 'none'")
+    if what == "contact" and not there:
+        return
+    if what == "tools":
+        tools = {"tip": (0.02, 0.03)} if there else {}
+        robot.told = msgspec.structs.replace(robot.told, frames={"tool": tools, "work": {}})
+    elif what != "contact":
+        robot.granted = Role.MAINTAINER if there else Role(what)
+    robot.silent.clear()
+    page.until(SHOWN)
+
+
+@pytest.mark.parametrize(
+    ("control", "what"),
+    [
+        *(("override", what) for what in ("lease", "contact", "viewer")),
+        *(("pose-name", what) for what in ("operator", "viewer")),
+        ("tool", "tools"),
+    ],
+)
+def test_keys_of_a_control_that_cannot_work_move_nothing_until_it_has_them_again(
+    enabled: Page, robot: FakeRobot, control: str, what: str
+) -> None:
+    change(enabled, robot, what, True)
+    enabled.until("!document.querySelector('.hold').disabled")
+    enabled.evaluate(f"document.querySelector('#{control}').focus()")
+    enabled.until_equal("document.activeElement.id", control)
+    for there in (False, True):
+        change(enabled, robot, what, there)
+        enabled.until_equal("document.activeElement.id", control if there else "")
+        for key in ("ArrowRight", "a"):
+            enabled.key_down(key)
+            settle(enabled)
+            enabled.key_up(key)
+        assert not robot.sent
+
+
+@pytest.mark.parametrize("by", ["pointer", "focus"])
+def test_keys_jog_again_when_the_operator_has_chosen_something_else(enabled: Page, robot: FakeRobot, by: str) -> None:
+    enabled.evaluate("document.querySelector('#pose-name').focus()")
+    change(enabled, robot, "operator", False)
+    enabled.until("document.activeElement === document.body && !document.querySelector('.hold').disabled")
+    if by == "pointer":
+        enabled.click("h1")
+    else:
+        enabled.evaluate("document.querySelector('[data-view=charts]').focus()")
+    enabled.key_down("ArrowRight")
+    wait_until(lambda: bool(robot.sent), "it jogs")
+    enabled.key_up("ArrowRight")
+    stands(robot)
+    change(enabled, robot, "operator", True)
+    enabled.until("document.querySelector('#pose-name').checkVisibility()")
+    assert enabled.evaluate("document.activeElement.id") == ""
 
 
 # ---------------------------------------------------------------------- a hand that leaves

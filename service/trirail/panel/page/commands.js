@@ -1,6 +1,7 @@
 // Commands, override and lease: what may be pressed now, and by whom. What a role may not do is not there.
 
 import { barriers } from "./barriers.js";
+import { withhold } from "./focus.js";
 import { number, onLanguage, say, time } from "./words.js";
 
 const SETTING = 1000; // time after the operator's last change until the override's slider shows the robot's value again [ms]
@@ -46,7 +47,7 @@ export class Commands {
 
   // Show what the role may at all.
   roles({ permissions, homes }) {
-    for (const element of document.querySelectorAll("[data-needs]")) element.hidden = !permissions.includes(element.dataset.needs);
+    for (const element of document.querySelectorAll("[data-needs]")) withhold(element, "hidden", !permissions.includes(element.dataset.needs));
     for (const button of document.querySelectorAll("[data-command]")) button.hidden = !permissions.includes(button.dataset.command);
     document.querySelector("[data-command=home]").hidden ||= homes.length === 0;
   }
@@ -83,7 +84,7 @@ export class Commands {
 // Bar a control for a reason, or let it work again and have its own title.
 function bar(control, reason) {
   const title = reason ? say(...reason) : control.dataset.sayTitle ? say(control.dataset.sayTitle) : "";
-  if (control.disabled !== Boolean(reason)) control.disabled = Boolean(reason);
+  withhold(control, "disabled", Boolean(reason));
   if (control.title !== title) control.title = title;
 }
 

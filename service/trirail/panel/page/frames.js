@@ -1,5 +1,7 @@
 // Poses, x, y [m] and φ [rad], of tools of the platform and in frames, as the service has them.
 
+import { withhold } from "./focus.js";
+
 export const NO_TOOL = [0, 0];
 export const BASE = [0, 0, 0];
 
@@ -32,5 +34,5 @@ export function inBase([x, y, phi], [fx, fy, angle]) {
 export function offer(select, entries) {
   const chosen = select.value;
   select.replaceChildren(...entries.map(([value, name]) => new Option(name, value, false, value === chosen)));
-  select.closest("label").hidden = entries.length < 2;
+  withhold(select.closest("label"), "hidden", entries.length < 2);
 }

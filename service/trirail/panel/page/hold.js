@@ -3,9 +3,12 @@
 // All of this runs on the page's own thread, so that a page that hangs says nothing and the robot brakes. A worker
 // would go on while the page hangs.
 
+import { owner } from "./focus.js";
+
 export const EVERY = 50; // between two signs of the hand [ms]; the service brakes 200 ms after the last
 export const HUNG = 180; // a sign so late comes from a page that has hung: what it held counts no more [ms]
 
+const OWN_KEYS = "input, select, #events, #sessions"; // what does something else with these keys
 const KEYS = {
   ArrowRight: ["x", 1], ArrowLeft: ["x", -1], ArrowUp: ["y", 1], ArrowDown: ["y", -1], a: ["phi", 1], d: ["phi", -1],
 };
@@ -59,9 +62,11 @@ export class Hold {
     if (event.ctrlKey || event.metaKey || event.altKey) return this.end(); // the key's end may be told to nobody
     const onButton = event.key === "Enter" && this.buttons.includes(event.target);
     const axis = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    if (!onButton && (!axis || event.target.matches("input, select, #events, #sessions"))) return;
+    if (!onButton && (!axis || event.target.matches(OWN_KEYS))) return;
     event.preventDefault();
     if (event.repeat) return;
+    const lost = owner();
+    if (lost?.matches(OWN_KEYS)) return this.barred(lost);
     const [name, sign] = axis ?? [];
     const matching = (each) => each.dataset.axis === name && Number(each.dataset.sign) === sign;
     this.#down(`key ${event.code}`, onButton ? event.target : this.buttons.find(matching));
