@@ -623,6 +623,16 @@ def test_events_come_with_their_time_the_past_too(page: Page, robot: FakeRobot) 
     page.until_equal("document.querySelector('#events li').className", "warning")
 
 
+def test_the_end_of_a_goal_stays_when_its_id_is_used_again(enabled: Page, robot: FakeRobot) -> None:
+    ends = ("done", "stopped", "rejected", "done")
+    for end in ends:
+        robot._say_begun("again")
+        robot.say(f"goal again {end}", kind="goal", id="again", outcome=end, user="ann")
+    robot._say_begun("again")
+    lines = "[...document.querySelectorAll('#events li[data-goal=again]')].map((each) => each.dataset.outcome ?? '')"
+    enabled.until_equal(lines, ["", *reversed(ends)])
+
+
 def test_events_are_shown_once_and_in_order_whatever_is_started_again(browser: Page, robot: FakeRobot) -> None:
     """So on a new connection of the tab, and after a service whose clock was set back."""
     shown = "[...document.querySelectorAll('#events li')].map((each) => each.event.message)"

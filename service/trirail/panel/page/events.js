@@ -25,7 +25,8 @@ export class Events {
     if (kind === "fault") this.faults.set(message, event);
     if (this.#isPartOfGoal(event)) return true;
     const goal = kind === "goal" ? event.id : kind === "mode" ? event.goal : undefined;
-    if (goal) [...this.list.children].find((each) => each.dataset.goal === goal)?.remove();
+    // An id may be used again by a later goal: the end of the earlier one stays.
+    if (goal) [...this.list.children].find((each) => each.dataset.goal === goal && !each.dataset.outcome)?.remove();
     const item = document.createElement("li");
     if (goal) item.dataset.goal = goal;
     item.event = event;
