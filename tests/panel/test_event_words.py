@@ -53,7 +53,8 @@ Object.defineProperty(globalThis, "navigator", { value: { languages: [process.ar
 const languages = { de: "Deutsch", en: "English" };
 const file = (name) => (name === "languages.json" ? languages : read(`${process.argv[2]}/${name}`));
 globalThis.fetch = async (name) => ({ json: async () => file(name) });
-const { event, obstacle } = await import("./service_words.js");
+const { event, obstacle, useLabels } = await import("./service_words.js");
+if (process.argv[4]) useLabels([...process.argv[4]]);
 const shown = read(0).map((each) => (each.kind ? event(each) : obstacle(each)));
 console.log(JSON.stringify(shown.map(({ textContent, title = null }) => [textContent, title])));
 """
@@ -70,9 +71,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def shown(folder: Path, events: list[dict[str, Any]], language: str = "de") -> list[tuple[str, str | None]]:
-    """Return what the page writes for events, and what it shows on hover."""
-    command = ["node", str(folder / "program.js"), str(PAGE), language]
+def shown(
+    folder: Path, events: list[dict[str, Any]], language: str = "de", labels: str = ""
+) -> list[tuple[str, str | None]]:
+    """Return what the page writes for events, and what it shows on hover. `labels` are a letter for each slider."""
+    command = ["node", str(folder / "program.js"), str(PAGE), language, labels]
     done = subprocess.run(command, input=json.dumps(events), capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     return [(text, title) for text, title in json.loads(done.stdout)]
@@ -180,6 +183,14 @@ def test_every_kind_of_event_is_german_with_every_code(folder: Path) -> None:
 def test_an_event_without_a_known_code_is_in_the_service_s_words(folder: Path, code: str | None) -> None:
     ((text, title),) = shown(folder, [{"kind": "service", "message": ENGLISH, "event_code": code, "params": {}}])
     assert (text, title) == (ENGLISH, None)
+
+
+@pytest.mark.parametrize("labels", ["", "UVW", "BCA"])
+def test_a_refusal_names_the_slider_as_the_robot_does(folder: Path, labels: str) -> None:
+    refused = {"kind": "refused", "code": RefusalCode.OUT_OF_WORKSPACE, "value": 0.16, "limit": 0.15, "user": "ann"}
+    cases = [refused | {"slider": slider, "message": ENGLISH} for slider in "ABC"]
+    for label, (text, _) in zip(labels or "ABC", shown(folder, cases, labels=labels), strict=True):
+        assert f"Schlitten {label} 160,00 mm" in text
 
 
 def test_english_is_the_service_s_own_sentence(folder: Path) -> None:

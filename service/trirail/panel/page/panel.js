@@ -13,7 +13,7 @@ import { Naming } from "./naming.js";
 import { Outputs } from "./outputs.js";
 import { Readings } from "./readings.js";
 import { Sessions } from "./sessions.js";
-import { refusal } from "./service_words.js";
+import { refusal, useLabels } from "./service_words.js";
 import { onLanguage, say } from "./words.js";
 
 const LEASED = { acquire: true, takeover: true, release: false }; // commands that take or give back the lease
@@ -87,6 +87,7 @@ const takes = {
   robot(said) {
     told = said;
     robot = { ...said, colours: { ...said.colours, sliders: said.colours.sliders.map(readable) } };
+    useLabels(robot.sliders);
     drawing = new Drawing(byId("mechanism"), robot);
     readings.robot(robot);
     charts.robot(robot);

@@ -4,6 +4,13 @@
 import { angle, apart, length } from "./units.js";
 import { has, number, quoted, say } from "./words.js";
 
+const SLIDERS = ["A", "B", "C"]; // as the service names them in refusals
+let labels = SLIDERS; // as this robot names them
+
+export function useLabels(sliders) {
+  labels = sliders;
+}
+
 // A refusal, or how a jog ended: {code, message, slider, value, limit}.
 export function refusal(told) {
   return worded(`refusal.${told.code}`, { ...told, bound: bound(told) }, told.message);
@@ -77,7 +84,7 @@ function cause(name, { drive = "", code = 0 }) {
 function bound({ slider, value, limit, code }) {
   if (code !== "out_of_workspace" || !slider || value == null || limit == null || !has("bound.slider")) return "";
   const [shown, bound] = apart(value, limit, "m");
-  return say("bound.slider", { slider, value: shown, limit: bound });
+  return say("bound.slider", { slider: labels[SLIDERS.indexOf(slider)], value: shown, limit: bound });
 }
 
 function worded(key, values, message) {
