@@ -86,6 +86,19 @@ def test_no_line_outlives_the_contact(enabled: Page, robot: FakeRobot) -> None:
     robot.silent.clear()
 
 
+@pytest.mark.parametrize(("language", "words"), [("en", "STOP may have no effect"), ("de", "STOP wirkt vielleicht")])
+def test_without_the_service_s_states_a_stop_is_sent_and_the_page_does_not_deny_it(
+    enabled: Page, robot: FakeRobot, language: str, words: str
+) -> None:
+    enabled.choose("#language", language)
+    enabled.until(f"document.documentElement.lang === {language!r}")
+    robot.silent.set()
+    enabled.until(f"document.querySelector('header').textContent.includes({words!r})")
+    enabled.click("#stop")
+    wait_until(lambda: "stop" in robot.commands, "a stop")
+    enabled.evaluate("localStorage.clear()")
+
+
 def test_a_way_is_checked_again_when_the_robot_stands_elsewhere(enabled: Page, robot: FakeRobot) -> None:
     typed(enabled, "100", "0", "0")
     enabled.until("document.querySelector('#going').dataset.may === 'yes'")
