@@ -28,6 +28,7 @@ from trirail.panel.recordings import Recordings
 from trirail.panel.server import MAX_MESSAGE, Panel, refused
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.state import Info
+from trirail.wire.vocabulary import Command
 from waiting import WITHIN, wait_until
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -309,7 +310,7 @@ def test_a_tab_keeps_the_lease_while_it_is_open_and_no_longer(end: str) -> None:
     with Panel(robot.robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
 
         def done(name: str) -> None:
-            opened.send(f'{{"do": "command", "name": "{name}"}}')
+            opened.send(f'{{"do": "command", "name": "{name}", "seen": {10**15}}}')
             while f'"done","to":"{name}"' not in (said := str(opened.recv(WITHIN))):
                 assert "refused" not in said
 
@@ -339,7 +340,7 @@ def test_what_is_pressed_while_the_lease_is_being_taken_leaves_one_lease_to_give
 
         def press(name: str) -> None:
             what = {"do": name} if name == "takeover" else {"do": "command", "name": name}
-            opened.send(msgspec.json.encode(what).decode())
+            opened.send(msgspec.json.encode(what | {"seen": 10**15}).decode())
 
         done: list[str] = []
 
@@ -379,16 +380,21 @@ def test_the_last_override_counts_however_slow_the_answers_are() -> None:
         assert robot.commands == ["override", "pause", "override"]
 
 
-MOVING: list[dict[str, Any]] = [
+REDUCES = {"disable", "stop", "quick_stop", "pause", "release"}
+"""Commands that only reduce motion."""
+ACTS: list[dict[str, Any]] = [
     {"do": "goal", "goal": {"kind": "move", "x": 0.001, "y": 0.0, "phi": 0.0}},
     {"do": "goal", "goal": {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}},
     {"do": "goal", "goal": {"kind": "named", "name": "park"}},
     {"do": "follow", "file": 0},
-    *({"do": "command", "name": name} for name in ("enable", "home", "resume")),
+    *({"do": "command", "name": name} for name in Command if name not in REDUCES),
     {"do": "command", "name": "override", "content": {"percent": 50.0}},
     {"do": "command", "name": "set_output", "content": {"output": "valve", "value": True}},
+    {"do": "takeover"},
+    {"do": "teach", "name": "here"},
+    {"do": "forget", "name": "park"},
 ]
-"""Messages that can cause motion or switch on power."""
+"""Messages that do more than reduce motion, so the operator must have seen the robot as it is."""
 
 
 def replies(panel: Panel, robot: FakeRobot, messages: list[dict[str, Any]], age_ms: int) -> list[dict[str, Any]]:
@@ -406,22 +412,22 @@ def replies(panel: Panel, robot: FakeRobot, messages: list[dict[str, Any]], age_
     return found
 
 
-@pytest.mark.parametrize("message", MOVING, ids=lambda message: str(message.get("name") or message["do"]))
-def test_what_can_move_the_robot_is_refused_with_words_where_the_page_is_late(message: dict[str, Any]) -> None:
+@pytest.mark.parametrize("message", ACTS, ids=lambda message: str(message.get("name") or message["do"]))
+def test_what_does_more_than_stop_is_refused_with_words_where_the_page_is_late(message: dict[str, Any]) -> None:
     """So is a press that a slow connection has held up. A stop is sent however late it is."""
     robot = FakeRobot()
     with Panel(robot.robot(), 0) as panel:
         refused, stopped = replies(panel, robot, [message], tab_requests.MAX_STATE_AGE_MS + 1000)
         assert (refused["tell"], refused["code"]) == ("refused", "outdated")
-        kinds = {"goal": message.get("goal", {}).get("kind"), "command": message.get("name"), "follow": "follow"}
-        assert refused["to"] == kinds[message["do"]]
+        kinds = {"goal": message.get("goal", {}).get("kind"), "command": message.get("name")}
+        assert refused["to"] == kinds.get(message["do"], message["do"])
         assert "press again" in refused["message"]
         assert (stopped["tell"], stopped["to"]) == ("done", "stop")
-        done = [*robot.commands, *robot.gone_to, *robot.moved_to, *robot.followed]
-        assert done == ["stop"]
+        done = [*robot.commands, *robot.gone_to, *robot.moved_to, *robot.followed, *robot.forced, *robot.named]
+        assert done == ["stop", "park"]
 
 
-@pytest.mark.parametrize("name", ["disable", "stop", "quick_stop", "pause", "release", "override"])
+@pytest.mark.parametrize("name", [*sorted(REDUCES), "override"])
 def test_no_stop_is_refused_however_late_it_is(name: str) -> None:
     robot = FakeRobot()
     content = {"content": {"percent": 0.0}} if name == "override" else {}

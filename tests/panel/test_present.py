@@ -122,13 +122,16 @@ def test_what_is_pressed_on_a_page_that_is_late_is_refused_in_words(
     monkeypatch.setattr(tab_requests, "MAX_STATE_AGE_MS", -1)
     before, why = robot.pose, {"en": "the page showed no state", "de": "die Anzeige war nicht aktuell"}[language]
     enabled.click("[data-step='1']")
-    for selector in (RIGHT, "#go", "[data-pose=park]", "[data-command=resume]"):
+    enabled.write("#pose-name", "here")
+    enabled.until("!document.querySelector('#teach').disabled")
+    for selector in (RIGHT, "#go", "[data-pose=park]", "[data-command=resume]", "[data-command=acquire]", "#teach"):
         enabled.evaluate("document.querySelector('#answer').textContent = ''")
         enabled.click(selector)
         enabled.until(f"{ANSWER}.includes({why!r})")
     enabled.click("#stop")
     wait_until(lambda: "stop" in robot.commands, "a stop")
     assert (robot.pose, robot.gone_to, robot.commands) == (before, [], ["enable", "stop"])
+    assert "here" not in robot.named
     enabled.evaluate("localStorage.clear()")
 
 

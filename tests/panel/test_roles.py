@@ -39,14 +39,14 @@ ACTIONS: list[tuple[str, dict[str, Any]]] = [
         "set_output",
         {"do": "command", "name": "set_output", "content": {"output": "valve", "value": True}, "seen": 10**15},
     ),
-    ("takeover", {"do": "takeover"}),
+    ("takeover", {"do": "takeover", "seen": 10**15}),
     ("goal", {"do": "hold", "velocity": [0.01, 0.0, 0.0], "seen": 10**15}),
     ("goal", {"do": "goal", "goal": {"kind": "move", "x": 0.001, "y": 0.0, "phi": 0.0}, "seen": 10**15}),
     ("goal", {"do": "goal", "goal": {"kind": "named", "name": "park"}, "seen": 10**15}),
     ("goal", {"do": "goal", "goal": {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}, "seen": 10**15}),
     ("goal", {"do": "follow", "file": 1, "seen": 10**15}),
-    ("poses", {"do": "teach", "name": "here"}),
-    ("poses", {"do": "forget", "name": "park"}),
+    ("poses", {"do": "teach", "name": "here", "seen": 10**15}),
+    ("poses", {"do": "forget", "name": "park", "seen": 10**15}),
 ]
 
 

@@ -17,9 +17,6 @@ from trirail.wire.goals import Coordinates, MoveGoal, NamedGoal, PoseGoal
 from trirail.wire.sizes import MAX_FILE
 from trirail.wire.vocabulary import Command, Override
 
-MOVING_COMMANDS = frozenset({Command.ENABLE, Command.HOME, Command.RESUME, Command.OVERRIDE, Command.SET_OUTPUT})
-"""Commands that can cause motion or switch on power."""
-
 
 class _PageMessage(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
     """Base class of the page's messages."""
@@ -65,16 +62,17 @@ class SendCommand(_PageMessage, frozen=True, tag="command"):
     content: Raw = Raw()
     """Content of the command, which the server forwards unchanged."""
     seen: int = 0
-    """Stamp of the newest state that the page has drawn."""
+    """Stamp of the newest state that the page has drawn. The server refuses the command if this state is outdated, and
+    the command does more than reduce motion."""
 
     @property
-    def moves(self) -> bool:
-        """Whether the command can cause motion or switch on power. The override 0 only stops the robot."""
+    def only_reduces_motion(self) -> bool:
+        """Whether the command only stops the robot or gives the lease back, as the override 0 does."""
         if self.name is Command.OVERRIDE:
             with contextlib.suppress(*INVALID):  # the service refuses invalid content
                 override: Override = decoded(bytes(self.content), Override)
-                return override.percent > 0.0
-        return self.name in MOVING_COMMANDS
+                return override.percent == 0.0
+        return self.name.stops or self.name is Command.RELEASE
 
     @property
     def required_permission(self) -> str:
@@ -86,6 +84,9 @@ class TakeOver(_PageMessage, frozen=True, tag="takeover"):
     """Request to take over the lease from its holder."""
 
     permission = TAKEOVER
+
+    seen: int
+    """Stamp of the newest state that the page has drawn. The server refuses the request if this state is outdated."""
 
 
 class SendGoal(_PageMessage, frozen=True, tag="goal"):
@@ -154,6 +155,8 @@ class Teach(_PageMessage, frozen=True, tag="teach"):
 
     name: str
     """Name of the pose."""
+    seen: int
+    """Stamp of the newest state that the page has drawn. The server refuses the request if this state is outdated."""
 
 
 class Forget(_PageMessage, frozen=True, tag="forget"):
@@ -163,6 +166,8 @@ class Forget(_PageMessage, frozen=True, tag="forget"):
 
     name: str
     """Name of the pose."""
+    seen: int
+    """Stamp of the newest state that the page has drawn. The server refuses the request if this state is outdated."""
 
 
 ServiceRequest = SendCommand | TakeOver | SendGoal | Follow | Teach | Forget

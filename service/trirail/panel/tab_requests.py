@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 from collections import Counter
 from collections.abc import Awaitable, Callable
-from functools import partial
 from typing import Any, Protocol
 
 from trirail.client import trajectory
@@ -23,7 +22,7 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import Command
 
 MAX_STATE_AGE_MS = 500
-"""Maximum age of the newest state on the page at which the page can move the robot [ms].
+"""Maximum age of the newest state on the page at which the page can do more than reduce motion [ms].
 
 If the state is older, the page or its connection has stalled, and the operator pressed the button some time ago."""
 MAX_PENDING = 8
@@ -59,8 +58,8 @@ class TabRequests:
         self._lease: AsyncLease | None = None
         self._acquiring = asyncio.Lock()
         """Lock that is held while the lease is being acquired, so that the tab never holds two leases."""
-        self._overrides: list[bytes | None] = []
-        """Content of the newest command override that has not been sent; empty if all have been sent."""
+        self._overrides: list[Callable[[], Awaitable[object]]] = []
+        """Function that sends the newest command override; empty if it has been called."""
         self._open = True
 
     def close(self) -> None:
@@ -72,34 +71,35 @@ class TabRequests:
     def begin(self, request: ServiceRequest) -> None:
         """Send a request in parallel with pending requests.
 
-        Ignore a command that is already pending. Refuse what can cause motion or power if the page's state is outdated.
-        Of the overrides that are requested while another override is pending, only the newest is sent.
+        Ignore a command that is already pending. If the page's state is outdated, refuse every request except commands
+        that only reduce motion. Of the overrides that are requested while another override is pending, only the newest
+        is sent.
         """
-        match request:
-            case SendCommand(Command.OVERRIDE, content) if not request.moves or is_fresh(request.seen):
-                self._loop.start(self._set_override(bytes(content) or None))
-            case SendCommand(name, content) if not request.moves or is_fresh(request.seen):
-                send = lambda: self._command(name, bytes(content) or None)  # noqa: E731
-                self._loop.start(self._answer(send, name))
-            case SendCommand(name):
-                self._reply("refused", to=name, name="", **OUTDATED)
-            case TakeOver():
-                self._loop.start(self._answer(lambda: self._acquire(force=True), "takeover"))
-            case SendGoal(goal, seen):
-                self._begin_motion(lambda: self._robot.send(goal), seen, kind_name(goal), getattr(goal, "name", ""))
-            case Follow(number, seen, stretch):
-                file = self._uploads.find(number)
-                self._begin_motion(lambda: self._follow(file, stretch), seen, "follow", file.name if file else "")
-            case Teach(name):
-                self._loop.start(self._answer(lambda: self._robot.teach(name), "teach", name))
-            case Forget(name):
-                self._loop.start(self._answer(lambda: self._robot.forget(name), "forget", name))
-
-    def _begin_motion(self, send: Callable[[], Awaitable[AsyncGoalHandle]], seen: int, kind: str, name: str) -> None:
-        if is_fresh(seen):
-            self._loop.start(self._answer(send, kind, name))
-        else:
+        kind, name, send = self._prepared(request)
+        reduces = isinstance(request, SendCommand) and request.only_reduces_motion
+        if not reduces and not is_fresh(request.seen):
             self._reply("refused", to=kind, name=name, **OUTDATED)
+        elif kind == Command.OVERRIDE:
+            self._loop.start(self._set_override(send))
+        else:
+            self._loop.start(self._answer(send, kind, name))
+
+    def _prepared(self, request: ServiceRequest) -> tuple[str, str, Callable[[], Awaitable[object]]]:
+        """Return the fields `to` and `name` of the result of a request, and the function that sends the request."""
+        match request:
+            case SendCommand(command, content):
+                return command, "", lambda: self._command(command, bytes(content) or None)
+            case TakeOver():
+                return "takeover", "", lambda: self._acquire(force=True)
+            case SendGoal(goal):
+                return kind_name(goal), getattr(goal, "name", ""), lambda: self._robot.send(goal)
+            case Follow(number, stretch=stretch):
+                file = self._uploads.find(number)
+                return "follow", file.name if file else "", lambda: self._follow(file, stretch)
+            case Teach(name):
+                return "teach", name, lambda: self._robot.teach(name)
+            case Forget(name):
+                return "forget", name, lambda: self._robot.forget(name)
 
     async def _answer(self, send_request: Callable[[], Awaitable[object]], kind: str, name: str = "") -> None:
         """Send a request, and send its result to the page.
@@ -130,11 +130,11 @@ class TabRequests:
         finally:
             self._pending.subtract((place, kind))
 
-    async def _set_override(self, content: bytes | None) -> None:
+    async def _set_override(self, send: Callable[[], Awaitable[object]]) -> None:
         """Set the override. The operator's slider sends one for each key press."""
-        self._overrides = [content]
+        self._overrides = [send]
         while self._overrides and not self._pending[Command.OVERRIDE]:
-            await self._answer(partial(self._command, Command.OVERRIDE, self._overrides.pop()), Command.OVERRIDE)
+            await self._answer(self._overrides.pop(), Command.OVERRIDE)
 
     async def _command(self, name: Command, content: bytes | None) -> CommandReply | None:
         if name is Command.ACQUIRE:
@@ -177,7 +177,7 @@ OUTDATED = {
 
 
 def is_fresh(seen: int) -> bool:
-    """Return whether the state with the stamp `seen` is new enough for a request that moves the robot."""
+    """Return whether the state with the stamp `seen` is new enough for a request that does more than reduce motion."""
     return now() - seen <= MAX_STATE_AGE_MS
 
 

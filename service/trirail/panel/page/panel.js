@@ -17,7 +17,7 @@ import { refusal, useLabels } from "./service_words.js";
 import { onLanguage, say } from "./words.js";
 
 const LEASED = { acquire: true, takeover: true, release: false }; // commands that take or give back the lease
-const SEEN = ["hold", "goal", "follow", "command"]; // messages that carry the stamp of the newest state that was drawn
+const SEEN = ["hold", "goal", "follow", "command", "takeover", "teach", "forget"]; // messages that carry the stamp of the newest state that was drawn
 const SILENT = 1500; // without a state for so long, what is shown is old [ms]
 const AGAIN = 500; // after so long a lost connection is tried again [ms]
 
@@ -53,7 +53,7 @@ const sessions = new Sessions(now);
 
 // ------------------------------------------------------------------ to the server
 
-// What can move the robot carries the stamp of the state that the operator saw: the server refuses it where that is old.
+// What acts on what the operator saw carries the stamp of that state: the server refuses it where that is old, but no stop.
 function send(message) {
   const whole = SEEN.includes(message.do) ? { ...message, seen } : message;
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(whole));
