@@ -15,11 +15,15 @@ from waiting import wait_until
 pytestmark = [pytest.mark.viewer, needs_chromium]
 
 PLUG = """
-window.pad = {connected: true, mapping: "standard", axes: [0, 0, 0, 0], quiet: null,
-  buttons: Array.from({length: 17}, () => ({pressed: false})),
-  get timestamp() { return this.quiet ?? performance.now(); }};
-navigator.getGamepads = () => [null, window.pad];
-dispatchEvent(new Event("gamepadconnected"));
+window.pads ??= [null];
+navigator.getGamepads = () => window.pads;
+(() => {
+  const pad = {connected: true, mapping: MAPPING, index: pads.length, axes: [0, 0, 0, 0], quiet: null,
+    buttons: Array.from({length: 17}, () => ({pressed: false})),
+    get timestamp() { return this.quiet ?? performance.now(); }};
+  pads.push(window.pad = pad);
+  dispatchEvent(Object.assign(new Event("gamepadconnected"), {gamepad: pad}));
+})();
 """
 EAST, LEFT, RIGHT, UP, DOWN = 1, 4, 5, 12, 13
 Do = Callable[[Page], None]
@@ -29,10 +33,15 @@ Do = Callable[[Page], None]
 def held(enabled: Page) -> Page:
     """A page with a gamepad whose shoulder buttons and sticks are let go."""
     enabled._call("Emulation.setFocusEmulationEnabled", enabled=True)
-    enabled.evaluate(PLUG)
+    plug(enabled)
     enabled.until("document.querySelector('#answer').textContent.includes('shoulder')")
     settle(enabled)
     return enabled
+
+
+def plug(page: Page, mapping: str = "standard") -> None:
+    """Connect one more gamepad, which is `pad` in the page from then on."""
+    page.evaluate(PLUG.replace("MAPPING", json.dumps(mapping)))
 
 
 def settle(page: Page) -> None:
@@ -167,3 +176,58 @@ def test_a_pad_where_nothing_may_move_says_why(held: Page, robot: FakeRobot) -> 
     held.until("document.querySelector('#answer').textContent.includes(document.querySelector('.hold').title)")
     held.until("document.querySelector('.hold').title")
     assert not robot.sent
+
+
+@pytest.mark.parametrize("pads", [("standard",), ("standard", "standard"), ("", "standard"), ("standard", "", "")])
+def test_the_stop_button_of_every_pad_that_is_announced_stops(
+    enabled: Page, robot: FakeRobot, pads: tuple[str, ...]
+) -> None:
+    enabled._call("Emulation.setFocusEmulationEnabled", enabled=True)
+    stops = 0
+    for number, mapping in enumerate(pads, start=1):
+        plug(enabled, mapping)
+        words = "east button stops" if mapping else "not supported"
+        enabled.until(f"document.querySelector('#answer').textContent.includes('{words}')")
+        settle(enabled)
+        for button in (EAST, LEFT, UP):
+            for down in (True, False):
+                enabled.evaluate(f"pads[{number}].buttons[{button}].pressed = {json.dumps(down)}")
+                settle(enabled)
+        stops += mapping == "standard"
+        wait_until(lambda: robot.commands.count("stop") == stops, "it stops")  # noqa: B023
+    assert robot.commands.count("stop") == stops
+
+
+@pytest.mark.usefixtures("slow_hand")
+def test_one_of_two_pads_moves_the_robot_until_its_own_shoulder_button_is_released(
+    held: Page, robot: FakeRobot
+) -> None:
+    plug(held)
+    settle(held)
+    jog(held, robot)
+    held.evaluate(f"pads[1].buttons[{LEFT}].pressed = true; pads[1].axes = [-1, 0, 0, 0]")
+    settle(held)
+    moves(robot)
+    press(held, RIGHT, False)
+    stands(robot)
+    asked = len(robot.sent)
+    settle(held)  # the other shoulder button was pressed while it could not move the robot
+    assert len(robot.sent) == asked
+    held.evaluate(f"pads[1].buttons[{LEFT}].pressed = false")
+    settle(held)
+    held.evaluate(f"pads[1].buttons[{LEFT}].pressed = true")
+    wait_until(lambda: robot.velocity[0] < 0.0, "it moves back")
+    held.evaluate(f"pads[1].buttons[{LEFT}].pressed = false")
+    stands(robot)
+
+
+@pytest.mark.usefixtures("slow_hand")
+def test_a_pad_that_moves_the_robot_ends_where_that_is_not_permitted_any_more(held: Page, robot: FakeRobot) -> None:
+    jog(held, robot)
+    robot.holder = "bob"
+    stands(robot)
+    asked = len(robot.sent)
+    robot.holder = None
+    held.until("!document.querySelector('.hold').disabled")
+    settle(held)
+    assert len(robot.sent) == asked

@@ -1,7 +1,7 @@
 // Jogging: while a button is held, or a gamepad's shoulder, or by a step for each press; along a frame, about a tool.
 
 import { offer, rotated } from "./frames.js";
-import { Pad } from "./gamepad.js";
+import { Pads } from "./gamepad.js";
 import { Hold } from "./hold.js";
 import { DEGREE, rounded, step, unit } from "./units.js";
 import { number, onLanguage, say } from "./words.js";
@@ -30,10 +30,11 @@ export class Jogging {
       (button) => barred(button.title),
     );
     const [button] = this.hold.buttons;
-    this.pad = new Pad({
+    this.pads = new Pads({
       sign, release, stop,
       faster: (by) => this.faster(by),
       found: () => answer(say("jog.pad")),
+      unknown: () => barred(say("jog.other_pad")),
       may: () => !button.disabled && this.hold.held.size === 0,
       barred: () => barred(button.title),
     });
@@ -45,7 +46,7 @@ export class Jogging {
 
   end() {
     this.hold.end();
-    this.pad.end();
+    this.pads.end();
   }
 
   choose(number) {
