@@ -75,12 +75,12 @@ def test_what_is_no_part_of_a_file_is_refused_and_the_tab_lives() -> None:
             json.dumps({"do": "follow"} | ask),
         ):
             opened.send(wrong)
-            assert answer(opened, "refused", "accepted")["code"] == "malformed"
+            assert answer(opened, "refused", "accepted")["tell"] == "refused"
         text = circle(4.0).encode()
         opened.send(json.dumps({"do": "upload", "file": 1, "name": "a.csv", "size": len(text)}))
         opened.send(text[:100])
         opened.send(json.dumps({"do": "follow"} | ask))
-        assert answer(opened, "refused", "accepted")["code"] == "malformed"
+        assert answer(opened, "refused", "accepted")["message"] == "the file has not been uploaded"
         assert not robot.followed
         opened.send(text[100:])
         opened.send(json.dumps({"do": "follow"} | ask))

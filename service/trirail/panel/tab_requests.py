@@ -149,7 +149,7 @@ class TabRequests:
 
     async def _follow(self, file: UploadedFile | None, stretch: bool) -> AsyncGoalHandle:
         if file is None:
-            raise RefusedError(RefusalCode.MALFORMED, "the file has not been uploaded")
+            raise TrirailError("the file has not been uploaded")
         points = await asyncio.to_thread(lambda: trajectory.parse(file.name, file.text))
         return await self._robot.follow(points, stretch=stretch)
 
