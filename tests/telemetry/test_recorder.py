@@ -12,6 +12,7 @@ import threading
 import weakref
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -228,6 +229,17 @@ def test_a_stuck_disk_is_left_alone_until_it_answers() -> None:
     assert stream.closed
 
 
+def test_a_batch_that_a_slow_disk_writes_late_is_not_written_twice() -> None:
+    stream = _Stream()
+    archive = Archive(stream, Path("/tmp/x.rrd"))  # type: ignore[arg-type]
+    first, second = (SimpleNamespace(id=name) for name in "ab")
+    stream.stuck = True
+    archive.write_chunks([first])  # type: ignore[list-item]
+    stream.stuck = False
+    archive.write_chunks([first, second])  # type: ignore[list-item]
+    assert stream.chunks == [first, second]
+
+
 @pytest.mark.parametrize("fails", ["before", "at that moment", "at the end"])
 def test_a_stream_whose_disk_fails_when_its_file_ends_is_not_destroyed(fails: str, tmp_path: Path) -> None:
     """Rerun would wait for the disk, and the recorder with it."""
@@ -262,11 +274,13 @@ class _Stream:
 
     def __init__(self) -> None:
         self.sent = 0
+        self.chunks: list[Chunk] = []
         self.stuck = False
         self.closed = False
 
     def send_chunks(self, chunks: list[Chunk]) -> None:
         self.sent += 1
+        self.chunks += chunks
 
     def flush(self, *, timeout_sec: float) -> None:
         if self.stuck:

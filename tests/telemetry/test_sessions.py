@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections import Counter
+from collections import Counter, namedtuple
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
 import made
 import msgspec
+import numpy as np
 import pytest
 from cyclopts import CycloptsError
 from hypothesis import given, settings
@@ -29,6 +30,10 @@ from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 from trirail.wire.vocabulary import Command
+
+SECOND = 1000
+"""Number of cycles per second."""
+Usage = namedtuple("Usage", "free")
 
 
 class Time:
@@ -131,6 +136,39 @@ def test_what_the_recorder_enters_is_what_its_files_hold(tmp_path: Path) -> None
     assert whole.cycles == 500
     assert whole.began == datetime.fromisoformat("2026-01-31 12:00:00").timestamp()
     assert whole.ended == pytest.approx(whole.began + 0.499)
+
+
+@settings(max_examples=10)
+@given(full=st.lists(st.booleans(), min_size=2, max_size=6), faults=st.lists(st.integers(0, 5), max_size=6))
+def test_contents_list_what_was_written_and_events_are_written_when_the_disk_has_room_again(
+    full: list[bool], faults: list[int]
+) -> None:
+    time = Time("2026-01-31 12:00:00")
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        recording = Recorder(
+            configured(), Path(folder), sidecars=True, live=False, wall_ns=time.wall, monotonic_ns=time.monotonic
+        )
+        for number, records in enumerate(np.split(made.records(len(full) * 1.0), len(full))):
+            patch.setattr("shutil.disk_usage", lambda _, number=number: Usage(free=0 if full[number] else 1 << 40))
+            for start in range(0, SECOND, 50):
+                time.ns = int(records[start : start + 50]["deadline_ns"][-1])
+                recording.records(records[start : start + 50].tobytes())
+                recording.save()
+            for seq in [seq for seq, at in enumerate(faults) if at == number]:
+                now, fault = time.wall() * 1e-9 + seq, FaultDetail("emcy", "B", 0x8700 + seq)
+                recording.event(
+                    Event("fault", "error", f"fault {seq}", fault=fault, seq=seq, t=number + 1.0, cycle=0, time=now)
+                )
+                recording.save()
+        recording.close()
+        (listed,) = find(recorded(Path(folder), on_read=lambda path: pytest.fail(f"{path} was read")))
+        (read,) = find([read_contents(recording.path)])
+    assert (listed.cycles, listed.lost_cycles) == (SECOND * full.count(False), SECOND * full.count(True))
+    if not all(full):
+        assert msgspec.structs.replace(listed, lost_cycles=0) == read
+    written = [seq for seq, at in enumerate(faults) if at < len(full)]
+    if not full[-1]:
+        assert sorted(listed.faults) == [f"fault {seq}" for seq in written]
 
 
 def test_a_disk_that_is_slow_at_the_start_changes_no_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -142,7 +142,7 @@ def _print(listed: list[RecordedSession], of: int) -> None:
             terminal.plain(", ".join(session.users)),
         )
         terminal.out.print("  ".join(filter(None, head)))
-        for line in filter(None, (*map(terminal.plain, session.files), _faults(session))):
+        for line in filter(None, (*map(terminal.plain, session.files), _faults(session), _lost(session))):
             terminal.out.print(Padding(line, (0, 0, 0, 4)))
     sessions = terminal.counted(of, "session")
     terminal.print_line(f"{len(listed)} of {sessions}" if len(listed) < of else sessions)
@@ -166,3 +166,10 @@ def _faults(session: RecordedSession) -> str:
         return ""
     more = len(session.faults) - 1
     return f"[red]{terminal.plain(session.faults[0])}[/]{f' and {more} more' if more else ''}"
+
+
+def _lost(session: RecordedSession) -> str:
+    """Return a warning if cycles could not be written; otherwise ""."""
+    if not session.lost_cycles:
+        return ""
+    return f"[yellow]not recorded: {terminal.counted(session.lost_cycles, 'cycle')}, because writing failed[/]"

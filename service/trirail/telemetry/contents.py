@@ -51,6 +51,7 @@ class Contents(msgspec.Struct):
     ended: float | None = None
     """Time of the last record [s since 1970]; None if the file contains no records."""
     cycles: int = 0
+    """Number of cycles in the file."""
     users: set[str] = msgspec.field(default_factory=set)
     """Users who sent goals or commands."""
     goals: dict[str, dict[str, int]] = msgspec.field(default_factory=dict)
@@ -64,6 +65,8 @@ class Contents(msgspec.Struct):
     """True while the file is still being written. The contents are then not final."""
     version: Literal[1] = 1
     """Version of the format of the sidecar; sidecars of other versions are ignored."""
+    lost_cycles: int = 0
+    """Number of cycles that the recorder could not write; 0 if the contents were read from the recording."""
 
     @property
     def session(self) -> str:

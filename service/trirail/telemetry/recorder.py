@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import time
+from collections import deque
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from rerun.chunk import Chunk
 from trirail_drivers import files
 
 from trirail.config import Config
@@ -20,6 +22,7 @@ from trirail.telemetry import contents, provenance, retention
 from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.contents import STAMP, Contents
 from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.journal import EVENTS, REQUESTS
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.rotation import RotatedFiles, claim
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
@@ -27,7 +30,7 @@ from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
-from trirail.wire.records import SIZE, last_cycle, unpack
+from trirail.wire.records import SIZE, last_cycle
 
 RECORDS_HZ = 5
 """Minimum number of batches of complete records per second written to the file."""
@@ -40,6 +43,8 @@ CHECKS_HZ = 1
 """Number of times per second that the files, the folder, the log and the live view are checked."""
 TIDY_EVERY = 10.0
 """Interval at which the folder is checked, and at which the sidecar of the newest file is written [s]."""
+MAX_UNWRITTEN = 1000
+"""Maximum number of batches of events that are kept until the disk has recovered."""
 MB = 1e6
 CLOCK_STEP_NS = 5_000_000
 """Minimum change of the wall clock against the monotonic clock that counts as a step [ns].
@@ -122,11 +127,16 @@ class Recorder:
         self._contents: Contents | None = None
         self._sidecar_error = ""
         """Reason why the last sidecar could not be written; empty if it was written."""
+        self._events: list[Event] = []
+        self._inputs: list[ControlInput] = []
+        """Events and inputs that have not been passed to the file; they are in its next batch of log lines."""
+        self._unwritten: deque[tuple[list[Chunk], list[Event]]] = deque(maxlen=MAX_UNWRITTEN)
+        """Batches of events that could not be written, the oldest first."""
         reserve = 0 if self._is_black_box else RESERVE
         self._first, self._own_files = first, first.parent
         self._files = RotatedFiles(first, self._open, streams.drop, reserve, lambda: monotonic_ns() * 1e-9, self._warn)
         self._records = Batches(config.loop.rate_hz // RECORDS_HZ, self._record)
-        streams.attach(self._files, DRAWING_HZ)
+        streams.attach(self, DRAWING_HZ)
         self._live: Relay | None = None
         self.live_url = ""
         """Address to which viewers connect; empty if there is no live view."""
@@ -135,12 +145,9 @@ class Recorder:
             streams.attach(self._live, LIVE_HZ)
             self.live_url = server.uri
         self._last: int | None = None
-        self._missed_cycles = 0
-        self._reported = (0, 0, 0)
+        self._missed_cycles, self._reported = 0, (0, 0, 0)
         self._next_check = 0
-        self._next_report = 0.0
-        self._next_tidy = 0.0
-        self._next_entry = 0.0
+        self._next_report = self._next_tidy = self._next_entry = 0.0
         self._tidy_error = ""
         self._reported_trouble = ""
         """Data reported as unrecorded, as returned by `unrecorded`; empty if no loss is being reported."""
@@ -206,10 +213,6 @@ class Recorder:
             self._run_checks()
         self._records.add(batch)
         self._streams.records(batch)
-        if self._contents is not None:
-            rows = unpack(batch)
-            began, ended = ((int(row["deadline_ns"]) + self._wall_offset_ns) * 1e-9 for row in (rows[0], rows[-1]))
-            self._contents.add_cycles(began, ended, len(rows))
 
     def save(self) -> None:
         """Write all records and log lines that have arrived, so that they survive the end of this process."""
@@ -219,14 +222,12 @@ class Recorder:
     def event(self, event: Event) -> None:
         """Write an event."""
         self._streams.event(event)
-        if self._contents is not None:
-            self._contents.event(event)
+        self._events.append(event)
 
     def control_input(self, item: ControlInput) -> None:
         """Write an input to the control loop."""
         self._streams.control_input(item)
-        if self._contents is not None:
-            self._contents.control_input(item)
+        self._inputs.append(item)
 
     def update_state(self, standing: ReadoutState) -> None:
         """Set the state that the readout shows from now on."""
@@ -241,6 +242,25 @@ class Recorder:
         if self._frames:
             self._frames.write(batch)
             self._frames_cause = self._frames.trouble or self._frames_cause
+
+    def write_chunks(self, chunks: list[Chunk]) -> None:
+        """Write a batch of drawings and log lines to the file.
+
+        Events that cannot be written are kept, and are written again with each later batch until they are written.
+        """
+        inputs: list[ControlInput] = []
+        if any(chunk.entity_path in (EVENTS, REQUESTS) for chunk in chunks):
+            self._unwritten.append(([chunk for chunk in chunks if chunk.entity_path == EVENTS], self._events))
+            inputs, self._inputs, self._events = self._inputs, [], []
+        kept = [chunk for events, _ in self._unwritten for chunk in events]
+        if not self._write([*kept, *(chunk for chunk in chunks if chunk.entity_path != EVENTS)]):
+            return
+        if self._contents is not None:
+            for event in (event for _, events in self._unwritten for event in events):
+                self._contents.event(event)
+            for item in inputs:
+                self._contents.control_input(item)
+        self._unwritten.clear()
 
     def close(self) -> None:
         """Write the remaining data and finish the file.
@@ -290,7 +310,20 @@ class Recorder:
         self._sidecar_error = words
 
     def _record(self, records: NDArray[np.void]) -> None:
-        self._files.write_chunks(self._streams.scene.complete(records))
+        is_written = self._write(self._streams.scene.complete(records))
+        if self._contents is None:
+            return
+        if is_written:
+            began, ended = ((int(row["deadline_ns"]) + self._wall_offset_ns) * 1e-9 for row in records[[0, -1]])
+            self._contents.add_cycles(began, ended, len(records))
+        else:
+            self._contents.lost_cycles += len(records)
+
+    def _write(self, chunks: list[Chunk]) -> bool:
+        """Write a batch to the newest file; return whether the batch was written."""
+        lost = self._files.lost
+        self._files.write_chunks(chunks)
+        return self._files.lost == lost
 
     def _flush(self) -> None:
         self._records.flush()

@@ -51,6 +51,8 @@ class RecordedSession(Struct):
     """Messages of the session's faults, in order."""
     running: bool = False
     """True while the session is still being recorded. The values are then some seconds old."""
+    lost_cycles: int = 0
+    """Number of cycles that could not be written, for example because the disk was full."""
 
 
 def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], None] | None = None) -> list[Contents]:
@@ -126,6 +128,7 @@ def _joined(parts: list[Contents]) -> RecordedSession:
         goals=dict(sorted(goals.items())),
         faults=[entry.message for entry in faults],
         running=any(part.running for part in parts),
+        lost_cycles=sum(part.lost_cycles for part in parts),
     )
 
 
