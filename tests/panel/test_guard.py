@@ -226,6 +226,16 @@ def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:
     assert session.session in str(recordings.report(session.session))
 
 
+def test_a_report_says_which_file_of_the_session_is_left_out(tmp_path: Path) -> None:
+    recorder = Recorder(load(SIM), tmp_path, live=False, sidecars=True)
+    recorder.records(made.records(0.1).tobytes())
+    recorder.close()
+    (tmp_path / f"{recorder.path.stem}-part2.rrd").touch()
+    report = str(Recordings("demo", lambda: str(tmp_path)).report(recorder.path.stem))
+    assert f"{recorder.path.stem}-part2.rrd: not a recording" in report
+    assert "100 at 1000 Hz" in report
+
+
 @pytest.mark.parametrize("name", ["best run.rrd", "Prüfung (2).rrd", 'a"b\r\nc.rrd', "%41.rrd", ".rrd"])
 def test_a_recording_is_sent_whatever_its_user_has_called_it(name: str, tmp_path: Path) -> None:
     """It is in the list, as `trirail sessions` has it."""

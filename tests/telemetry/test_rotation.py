@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections import namedtuple
 from datetime import date
 from pathlib import Path
@@ -17,12 +19,14 @@ import made
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from telemetry.test_recorder import configured
+from trirail.cli.app import app
 from trirail.config import SIM, Config, load, parse
+from trirail.errors import ServiceError
 from trirail.processes import loop
 from trirail.processes.recording import GATHER
 from trirail.processes.reports import BATCHES_PER_SECOND
@@ -194,6 +198,39 @@ def test_a_recording_goes_on_in_another_file_after_its_time(tmp_path: Path) -> N
     read_back = [read(path) for path in files]
     assert [len(part.records) for part in read_back] == pytest.approx([1000] * 3, abs=2 * BATCH)
     assert made.bits(join(read_back).records) == made.bits(sent)
+
+
+@pytest.fixture(scope="module")
+def rotated(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return by_time(tmp_path_factory.mktemp("rotated"))[1]
+
+
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    damage=st.lists(st.sampled_from(["none", "empty", "nul", "no records", "text"]), min_size=3, max_size=3),
+    order=st.permutations(range(3)),
+)
+def test_a_session_is_read_without_the_files_that_a_power_cut_has_spoilt(
+    rotated: list[Path], damage: list[str], order: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        files = [Path(shutil.copy(path, folder)) for path in rotated]
+        for path, how in zip(files, damage, strict=True):
+            whole = path.read_bytes()
+            spoilt = {"none": whole, "empty": b"", "nul": bytes(1000), "no records": whole[:100], "text": b"no data"}
+            path.write_bytes(spoilt[how])
+        command = ["report", "--json", *(str(files[number]) for number in order)]
+        if damage.count("none") == 0:
+            with pytest.raises(ServiceError):
+                app(command, exit_on_error=False, result_action="return_value")
+            return
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            assert app(command, exit_on_error=False, result_action="return_value") == 0
+        alone = [len(read(path).records) for path, how in zip(files, damage, strict=True) if how == "none"]
+    assert json.loads(capsys.readouterr().out)["cycles"] == sum(alone)
+    skipped = [path for path, how in zip(files, damage, strict=True) if how != "none"]
+    assert sorted(str(each.message).partition(":")[0] for each in told) == sorted(map(str, skipped))
 
 
 def test_every_file_is_complete_in_itself(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ class Recordings:
         return AlreadySent(status.value, status.phrase, Headers())
 
     def report(self, session: str) -> str | None:
-        """Run `trirail report` for a session in a separate process; return the output.
+        """Run `trirail report` for a session in a separate process; return its warnings or its error, and the report.
 
         Return None if the session does not exist.
         """
@@ -103,7 +103,7 @@ class Recordings:
             return None
         with self._one_report:
             done = self._run("report", *files)
-        return (done.stdout or done.stderr).decode(errors="replace")
+        return (done.stderr + done.stdout).decode(errors="replace")
 
     @property
     def _folder(self) -> Path:

@@ -3,7 +3,7 @@
 from trirail import read
 recording = read("recordings/demo-20260101-120000.rrd")
 error = recording.records["following_error"]      # (N, 3) [m]; the fields are those of trirail.wire.records
-session = join([read(path) for path in parts])    # all files of a rotated recording, in any order
+session = read_session(paths)                     # all files of a rotated recording, in any order
 """
 
 from __future__ import annotations
@@ -66,6 +66,10 @@ class OlderRecordingWarning(UserWarning):
     """Warning that a recording lacks fields that were added to the records later."""
 
 
+class SkippedFileWarning(UserWarning):
+    """Warning that one of a session's files cannot be read, and is left out."""
+
+
 def read(path: str | os.PathLike[str]) -> Recording:
     """Read a recording (.rrd), without changing the file.
 
@@ -111,6 +115,35 @@ def read(path: str | os.PathLike[str]) -> Recording:
         texts=texts,
         requests=_requests([chunk for chunk in chunks if chunk.entity_path == REQUESTS], path),
     )
+
+
+def read_session(paths: Sequence[str | os.PathLike[str]]) -> Recording:
+    """Read and join the files of a session, given in any order.
+
+    If there are several files, a file that cannot be read or is empty is left out. A power cut can leave such a file.
+
+    Raises
+    ------
+    ServiceError
+        No file can be read, or the recordings belong to different sessions.
+
+    Warns
+    -----
+    SkippedFileWarning
+        A file was left out.
+    """
+    parts: list[Recording] = []
+    errors: list[ServiceError] = []
+    for path in paths:
+        try:
+            parts.append(read(path))
+        except ServiceError as error:
+            errors.append(error)
+    if not parts:
+        raise errors[0]
+    for error in errors:
+        warnings.warn(f"{error}; this file is left out", SkippedFileWarning, stacklevel=2)
+    return join(parts)
 
 
 def join(parts: Sequence[Recording]) -> Recording:
