@@ -34,10 +34,29 @@ def test_a_switch_sets_its_output_and_shows_its_value(page: Page, robot: FakeRob
     page.until(f"document.querySelector('{VALVE}').ariaChecked === 'false'")
 
 
-def test_a_lamp_shows_its_input(page: Page, robot: FakeRobot) -> None:
-    page.until("document.querySelector('#inputs .lamp') && !document.querySelector('#inputs .on')")
-    robot.inputs["part"] = True
-    page.until("document.querySelector('#inputs .on')?.textContent === 'part'")
+@pytest.mark.parametrize("element", ["#outputs button", "#inputs > *"])
+@pytest.mark.parametrize(("language", "words"), [("en", ["off", "on"]), ("de", ["aus", "ein"])])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_value_is_seen_by_a_word_and_a_lamp_until_contact_is_lost(
+    page: Page, robot: FakeRobot, element: str, language: str, words: list[str], scheme: str
+) -> None:
+    page.colours(scheme)
+    page.choose("#language", language)
+    name = "valve" if element.startswith("#outputs") else "part"
+    shown = f"document.querySelector({element!r}).innerText.split(/\\s+/)"
+    lamp = f"getComputedStyle(document.querySelector({element + ' .lamp'!r})).backgroundColor"
+    lamps = []
+    for value, word in enumerate(words):
+        robot.outputs["valve"] = robot.inputs["part"] = bool(value)
+        page.until(f"{shown}.join() === '{name},{word}'")
+        lamps.append(page.evaluate(lamp))
+    assert lamps[0] == "rgba(0, 0, 0, 0)" != lamps[1]
+    robot.silent.set()
+    page.until(f"{shown}.join() === '{name},–'")
+    assert page.evaluate(lamp) == lamps[0]
+    robot.silent.clear()
+    page.until(f"{shown}.join() === '{name},{words[1]}'")
+    page.evaluate("localStorage.clear()")
 
 
 def test_a_viewer_cannot_switch(browser: Page, robot: FakeRobot) -> None:

@@ -1,4 +1,4 @@
-// Digital outputs as switches, for who may, and inputs as lamps; on the drawing a tick where an output has switched.
+// Digital outputs as switches, for who may, and inputs, each with a lamp and a word for its value; on the drawing a tick where an output has switched.
 
 import { say } from "./words.js";
 
@@ -13,31 +13,35 @@ export class Outputs {
     this.send = send;
     this.answer = answer;
     this.goal = null; // the goal whose switches are on the drawing
+    this.shown = { outputs: new Map(), inputs: new Map() }; // the element of each name
   }
 
   robot({ outputs, inputs }) {
     byId("digital").hidden = outputs.length + inputs.length === 0;
-    this.switches = new Map(outputs.map((name) => [name, this.#made("button", name)]));
-    this.lamps = new Map(inputs.map((name) => [name, this.#made("span", name)]));
-    for (const [name, button] of this.switches) {
+    this.shown.outputs = new Map(outputs.map((name) => [name, made("button", name)]));
+    this.shown.inputs = new Map(inputs.map((name) => [name, made("span", name)]));
+    for (const [name, button] of this.shown.outputs) {
       button.disabled = true;
       button.dataset.output = name;
       button.setAttribute("role", "switch");
       button.addEventListener("click", () => {
+        const value = button.getAttribute("aria-checked");
+        if (value === null) return; // nobody has seen what the press would change
         this.answer(say("do.set_output"));
-        this.send({ do: "command", name: "set_output", content: { output: name, value: button.getAttribute("aria-checked") !== "true" } });
+        this.send({ do: "command", name: "set_output", content: { output: name, value: value !== "true" } });
       });
     }
-    byId("outputs").replaceChildren(...this.switches.values());
-    byId("inputs").replaceChildren(...this.lamps.values());
+    for (const kind of ["outputs", "inputs"]) byId(kind).replaceChildren(...this.shown[kind].values());
+    this.lost();
   }
 
-  state({ outputs, inputs }) {
-    for (const [name, button] of this.switches) button.setAttribute("aria-checked", Boolean(outputs[name]));
-    for (const [name, lamp] of this.lamps) {
-      lamp.className = inputs[name] ? "lamp on" : "lamp";
-      lamp.title = say(inputs[name] ? "input.on" : "input.off");
-    }
+  state(state) {
+    for (const [kind, elements] of Object.entries(this.shown)) for (const [name, element] of elements) show(element, state[kind][name]);
+  }
+
+  // Nobody knows the values.
+  lost() {
+    this.state({ outputs: {}, inputs: {} });
   }
 
   // Draw where outputs will switch on the path of a goal, and where they have, until another goal has marks.
@@ -48,11 +52,25 @@ export class Outputs {
     for (const { output, value, pose, number = 1 } of planned) drawing.tick(pose, "planned", label(output, value, number));
     for (const { output, value, commanded } of marks) drawing.tick(commanded, value ? "on" : "off", label(output, value, 1));
   }
+}
 
-  #made(kind, name) {
-    const made = document.createElement(kind);
-    made.textContent = name;
-    made.translate = false;
-    return made;
-  }
+// A lamp, a name and a word for the value.
+function made(kind, name) {
+  const made = document.createElement(kind);
+  made.className = "digital";
+  const parts = ["i", "span", "b"].map((part) => document.createElement(part));
+  parts[0].className = "lamp";
+  parts[1].textContent = name;
+  parts[1].translate = false;
+  made.append(...parts);
+  return made;
+}
+
+// Show a value; undefined where it is unknown.
+function show(element, value) {
+  const word = value === undefined ? "–" : say(value ? "input.on" : "input.off");
+  if (element.lastChild.textContent !== word) element.lastChild.textContent = word;
+  element.classList.toggle("on", value === true);
+  if (value === undefined) element.removeAttribute("aria-checked");
+  else if (element.role === "switch") element.setAttribute("aria-checked", value);
 }

@@ -180,6 +180,7 @@ function lost(why) {
   document.body.dataset.contact = "none";
   readings.lost(say(`lost.${why}`));
   charts.lost();
+  outputs.lost();
   line.clear();
   commands.show();
   allow();
