@@ -83,6 +83,8 @@ class FakeRobot:
         self.warnings: tuple[str, ...] = ()
         self.forced: list[bool] = []
         self.named = {"park": (0.0, 0.05, 0.0)}
+        self.foreign: set[str] = set()
+        """Names of the poses that were taught with another geometry."""
         self.gone_to: list[str] = []
         self.sent: list[VelocityGoal] = []
         self.commands: list[str] = []
@@ -147,7 +149,10 @@ class FakeRobot:
             return self._handle(goal_id)
 
     def poses(self) -> dict[str, NamedPose]:
-        return {name: NamedPose(name, *pose, taught=name != "park") for name, pose in self.named.items()}
+        return {
+            name: NamedPose(name, *pose, taught=name != "park", other_geometry=name in self.foreign)
+            for name, pose in self.named.items()
+        }
 
     def _move_to_named(self, name: str, speed: float) -> GoalHandle:
         if name not in self.named:

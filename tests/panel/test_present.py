@@ -107,6 +107,46 @@ def test_a_way_is_checked_again_when_the_robot_stands_elsewhere(enabled: Page, r
     assert "on the way" in enabled.text("#going-says")
 
 
+@pytest.mark.parametrize("view", ["mechanism", "charts", "sessions"])
+def test_warnings_are_seen_in_every_view_while_they_are_in_force(page: Page, robot: FakeRobot, view: str) -> None:
+    full, certificate = "nothing is recorded: the disk is full", "the certificate of ann expires in 3 days"
+    page.click(f"[data-view={view}]")
+    robot.warnings = (full, certificate)
+    page.until(f"document.body.innerText.includes({full!r}) && document.body.innerText.includes({certificate!r})")
+    page.until(f"document.querySelector('header').innerText.includes({full!r})")
+    robot.warnings = (certificate,)
+    page.until(f"!document.body.innerText.includes({full!r})")
+    assert certificate in page.text("header")
+    robot.silent.set()
+    page.until(f"!document.body.innerText.includes({certificate!r})")
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_a_pose_of_another_geometry_is_marked_and_asks_first(enabled: Page, robot: FakeRobot, language: str) -> None:
+    enabled.choose("#language", language)
+    robot.foreign, old = {"old", "older"}, "[data-pose=old]"
+    for name in ("new", "old", "older"):
+        robot.teach(name)
+    enabled.until_equal(
+        "[...document.querySelectorAll('#poses button')].map((each) => each.innerText)",
+        ["park", "new", "⚠ old", "⚠ older"],
+    )
+    assert {"en": "another geometry", "de": "anderen Geometrie"}[language] in enabled.evaluate(
+        f"document.querySelector('{old}').title"
+    )
+    for other in ("[data-pose=older]", "[data-pose=new]"):  # the answer is the second press on the same pose
+        enabled.click(old)
+        enabled.until(f"{ANSWER}.includes('old') && document.querySelector('{old}').classList.contains('asked')")
+        enabled.click(other)
+        enabled.until(f"!document.querySelector('{old}').classList.contains('asked')")
+    wait_until(lambda: robot.gone_to == ["new"], "the pose that asks nothing")
+    enabled.click(old)
+    enabled.evaluate("(() => { const now = performance.now(); performance.now = () => now + 1000; })()")
+    enabled.click(old)
+    wait_until(lambda: robot.gone_to == ["new", "old"], "the pose that asks")
+    enabled.evaluate("localStorage.clear()")
+
+
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_what_is_pressed_on_a_page_that_is_late_is_refused_in_words(
     enabled: Page, robot: FakeRobot, language: str, monkeypatch: pytest.MonkeyPatch

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -314,11 +313,7 @@ def test_sessions_are_listed_reported_and_downloaded(page: Page, panel: Panel, t
 
 
 def test_where_there_is_nothing_here_that_is_said(page: Page, robot: FakeRobot, tmp_path: Path) -> None:
-    robot.warnings = ("nothing is recorded: the disk is full",)
     assert str(tmp_path) in sessions(page)
-    deadline = time.monotonic() + 60.0
-    while "the disk is full" not in sessions(page):
-        assert time.monotonic() < deadline
     assert "not on the panel's" in sessions(page)
 
 

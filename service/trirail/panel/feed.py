@@ -152,7 +152,8 @@ class Feed:
                 return self.messages["poses"]
             poses = {}
         taught = [name for name, pose in poses.items() if pose.taught]
-        return msgspec.json.encode({"tell": "poses", "names": list(poses), "taught": taught})
+        foreign = [name for name, pose in poses.items() if pose.other_geometry]
+        return msgspec.json.encode({"tell": "poses", "names": list(poses), "taught": taught, "foreign": foreign})
 
     async def _receive_events(self) -> None:
         numbers = itertools.count(1)

@@ -1,4 +1,5 @@
-// Named poses: gone to by a press, taught where the robot stands, forgotten; what would be lost is asked about first.
+// Named poses: gone to by a press, taught where the robot stands, forgotten. A question comes first where something would be
+// lost, and where a pose was taught with another geometry.
 
 import { onLanguage, say } from "./words.js";
 
@@ -17,6 +18,7 @@ export class Naming {
     this.ask = ask;
     this.names = [];
     this.taught = [];
+    this.foreign = []; // names of the poses that were taught with another geometry
     this.question = null; // what is asked, of which name, and since when
     byId("pose-name").addEventListener("input", () => {
       this.#withdraw();
@@ -24,9 +26,9 @@ export class Naming {
     });
     byId("teaching").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.#do("teach", this.taught.includes(this.name));
+      this.#named("teach", this.taught.includes(this.name));
     });
-    byId("forget").addEventListener("click", () => this.#do("forget", true));
+    byId("forget").addEventListener("click", () => this.#named("forget", true));
     onLanguage(() => this.#withdraw());
   }
 
@@ -35,9 +37,8 @@ export class Naming {
   }
 
   // A pose keeps its place while the page is open, so that no other one comes under a finger.
-  poses({ names, taught }) {
-    this.names = names;
-    this.taught = taught;
+  poses({ names, taught, foreign }) {
+    Object.assign(this, { names, taught, foreign });
     const places = [...byId("poses").children].map((each) => (names.includes(each.dataset.pose) ? each.dataset.pose : ""));
     for (const name of names.filter((each) => !places.includes(each))) {
       const free = places.indexOf("");
@@ -53,28 +54,41 @@ export class Naming {
     const button = document.createElement("button");
     button.type = "button"; // of a form, but not what sends it
     button.translate = false;
-    button.dataset.pose = button.textContent = name;
+    button.dataset.pose = name;
+    const foreign = this.foreign.includes(name);
+    if (foreign) button.dataset.sayTitle = "poses.foreign";
     button.addEventListener("click", () => {
+      if (foreign && !this.#sure("named", name)) return;
+      this.#withdraw();
       this.answer(say("do.named", { name }));
       this.send({ do: "goal", goal: { kind: "named", name, speed: this.speed() } });
     });
     return button;
   }
 
-  #do(what, loses) {
-    const { name, question } = this;
+  #named(what, loses) {
+    const { name } = this;
     if (!name) return byId("pose-name").focus();
-    const now = performance.now();
-    if (loses && question?.what === what && now - question.since < DOUBLE) return;
-    if (loses && question?.what !== what) {
-      this.#withdraw();
-      this.question = { what, since: now, timer: setTimeout(() => this.#withdraw(), ASKED) };
-      this.#show();
-      return this.ask(say(`ask.${what}`, { name }));
-    }
+    if (loses && !this.#sure(what, name)) return;
     this.#withdraw();
     this.answer(`${say(`do.${what}`)} ${name}`);
     this.send({ do: what, name });
+  }
+
+  // Whether the press answers the question; if the question is not open, ask it.
+  #sure(what, name) {
+    const { question } = this;
+    const now = performance.now();
+    if (question?.what === what && question.name === name) {
+      if (now - question.since < DOUBLE) return false;
+      this.#withdraw();
+      return true;
+    }
+    this.#withdraw();
+    this.question = { what, name, since: now, timer: setTimeout(() => this.#withdraw(), ASKED) };
+    this.#show();
+    this.ask(say(`ask.${what}`, { name }));
+    return false;
   }
 
   #withdraw() {
@@ -89,6 +103,12 @@ export class Naming {
       const asked = this.question?.what === what;
       byId(what).classList.toggle("asked", asked);
       byId(what).textContent = say(asked ? "ask.again" : `do.${what}`);
+    }
+    for (const button of document.querySelectorAll("#poses button")) {
+      const name = button.dataset.pose;
+      const asked = this.question?.what === "named" && this.question.name === name;
+      button.classList.toggle("asked", asked);
+      button.textContent = asked ? say("ask.again") : this.foreign.includes(name) ? `⚠ ${name}` : name;
     }
   }
 }

@@ -49,7 +49,7 @@ const going = new Going(send, now, answer, speed);
 const following = new Following(send, sendPart, now, allow, answer, speed);
 const naming = new Naming(send, allow, answer, speed, note);
 const outputs = new Outputs(send, answer);
-const sessions = new Sessions(now);
+const sessions = new Sessions();
 
 // ------------------------------------------------------------------ to the server
 

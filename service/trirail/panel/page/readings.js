@@ -32,7 +32,7 @@ export class Readings {
     });
   }
 
-  state({ mode, pose, goal, sliders, faults, override }) {
+  state({ mode, pose, goal, sliders, faults, override, warnings }) {
     const doing = [];
     const waits = mode === "holding" || override === 0;  // half-way, paused or at override 0
     if (goal?.lag != null) doing.push(say("doing.track", { lag: length(goal.lag, 1) }));
@@ -44,6 +44,7 @@ export class Readings {
     text(byId("mode-name"), say(`mode.${mode}`, {}, mode));
     text(byId("doing"), doing.join(" · "));
     byId("lamp").style.background = this.colours[mode] ?? "transparent";
+    warn(warnings);
     this.alarm(faults.length ? say("fault") : "", faults, faults.length ? say("fault.remedy") : "");
     const shown = (value, k) => (k < 2 ? length(value) : angle(value));
     this.pose.forEach(([measured, target], k) => {
@@ -61,6 +62,7 @@ export class Readings {
     text(byId("doing"), "");
     byId("lamp").style.background = "transparent";
     for (const cell of [...this.pose, ...this.sliders].flat()) text(cell, "–");
+    warn([]);
     this.alarm(why);
   }
 
@@ -84,6 +86,13 @@ function rows(body, names, columns) {
     row.append(head);
     return Array.from({ length: columns }, () => row.insertCell());
   });
+}
+
+// The warnings in force: the first beside the mode, all of them above the events.
+function warn(warnings) {
+  const [first = "", ...more] = warnings;
+  text(byId("warning"), first && more.length ? `${first} (+${more.length})` : first);
+  text(byId("warnings"), warnings.join("\n"));
 }
 
 function text(element, words) {

@@ -6,9 +6,7 @@ const HEADS = ["began", "lasted", "goals", "faults", "files"];
 const byId = (id) => document.getElementById(id);
 
 export class Sessions {
-  // `now()` has the robot's state.
-  constructor(now) {
-    this.now = now;
+  constructor() {
     this.told = null;
     onLanguage(() => this.#show());
   }
@@ -26,16 +24,14 @@ export class Sessions {
   #show() {
     if (this.told === null) return byId("sessions").replaceChildren();
     const { folder, here, sessions } = this.told;
-    const warnings = (this.now().state?.warnings ?? []).map((words) => cell("p", quoted(words))); // as that nothing is recorded
-    for (const each of warnings) each.className = "warning";
     if (!here || !sessions.length)
-      return byId("sessions").replaceChildren(...warnings, say(here ? "sessions.none" : "sessions.elsewhere"), " ", quoted(folder));
+      return byId("sessions").replaceChildren(say(here ? "sessions.none" : "sessions.elsewhere"), " ", quoted(folder));
     const table = document.createElement("table");
     const head = table.createTHead().insertRow();
     for (const name of HEADS) head.append(cell("th", say(`sessions.${name}`)));
     const body = table.createTBody();
     for (const each of sessions) row(body.insertRow(), each);
-    byId("sessions").replaceChildren(...warnings, table);
+    byId("sessions").replaceChildren(table);
   }
 }
 
