@@ -13,9 +13,9 @@ from panel.fake_robot import FakeRobot
 from panel.test_gamepad import settle
 from panel.test_page import moves, small, stands, typed
 from trirail.errors import RefusalCode, RefusedError
-from trirail.panel import tab_requests
+from trirail.panel import feed, tab_requests
 from trirail.panel.server import Panel
-from trirail.wire.state import GoalState, Pose
+from trirail.wire.state import DigitalLine, GoalState, Pose
 from trirail.wire.vocabulary import Command, Mode, Role
 from waiting import wait_until
 
@@ -119,6 +119,30 @@ def test_warnings_are_seen_in_every_view_while_they_are_in_force(page: Page, rob
     assert certificate in page.text("header")
     robot.silent.set()
     page.until(f"!document.body.innerText.includes({certificate!r})")
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize(
+    "later", [{"limits": {"reach": 1.0}}, {"takeover": "owner"}, {"output_lines": {"valve": DigitalLine("D", 0)}}]
+)
+def test_nothing_moves_and_the_cure_is_told_while_a_later_service_is_not_understood(
+    enabled: Page, robot: FakeRobot, language: str, later: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed, "USERS_PERIOD_S", 0.05)
+    enabled.choose("#language", language)
+    robot.silent.set()
+    enabled.until("document.body.dataset.contact === 'none'")
+    before, robot.told = robot.told, msgspec.structs.replace(robot.told, **later)
+    robot.silent.clear()
+    enabled.until("document.querySelector('#alarm').innerText.includes('trirail panel')")
+    enabled.until("document.querySelector('.hold').disabled")
+    assert {"en": "restart trirail panel", "de": "trirail panel neu starten"}[language] in enabled.text("#alarm")
+    assert (enabled.evaluate("document.body.dataset.contact"), "mm" in enabled.text("#pose")) == ("none", False)
+    enabled.click("#stop")
+    wait_until(lambda: robot.commands[-1] == "stop", "a stop")
+    robot.told = before  # by an older service, or only a late answer
+    enabled.until(SHOWN)
+    enabled.evaluate("localStorage.clear()")
 
 
 @pytest.mark.parametrize("language", ["en", "de"])

@@ -56,7 +56,7 @@ class Feed:
         loop.call(self._fetch_robot())
         self.messages["poses"] = loop.call(self._fetch_poses())
         self.state: bytes | None = None
-        """Newest state and its stamp as JSON; None while the service is silent."""
+        """Newest state and its stamp as JSON; None while the service is silent or its description is not known."""
         self.stamp = 0
         """Arrival time of the newest state, in milliseconds of this process's monotonic clock."""
         self._events: deque[tuple[int, bytes]] = deque(maxlen=MAX_EVENTS)
@@ -64,8 +64,8 @@ class Feed:
         """Events of the latest alignment, which are stored even after MAX_EVENTS later events."""
         self._alignment = ("", "")
         self._subscriptions: list[Callable[[], None]] = []
-        self._is_described = True
-        """Whether the service has answered with its description since it was last silent."""
+        self.trouble = ""
+        """Reason why the description could not be read since the service was last silent; empty if it was read."""
 
     def start(self) -> None:
         """Start the subscriptions."""
@@ -97,36 +97,47 @@ class Feed:
         return path_check.check_path(self._robot_drawing, name, text, stretch)
 
     async def _receive_states(self) -> None:
+        is_new = False
         while True:
             async with aclosing(self._robot.states(SILENCE_S)) as states:
                 async for state in states:
-                    if self.state is None:
+                    if is_new:  # a service that was silent may have restarted
                         await self._describe()
+                        is_new = False
+                    if self.trouble:  # the page would use the limits and the drawing of another robot
+                        continue
                     stamp = now()
                     content = msgspec.json.encode({"tell": "state", "stamp": stamp, "state": state})
                     with self.changed:
                         self.state, self.stamp, self._pose = content, stamp, state.pose
                         self.changed.notify_all()
+            is_new = True
             with self.changed:
                 self.state = self._pose = None
+                self.trouble = ""
                 self.changed.notify_all()
 
     async def _poll_users(self) -> None:
         while True:
             await asyncio.sleep(USERS_PERIOD_S)
-            if not self._is_described:
+            if self.trouble:
                 await self._describe()
             with contextlib.suppress(TrirailError):
                 self._publish("users", msgspec.json.encode({"tell": "users", "names": await self._robot.users()}))
 
     async def _describe(self) -> None:
-        """Query the description of the robot again, because a service that was silent may have restarted."""
-        self._is_described = False
+        """Query the description of the robot and its poses; if that fails, set `trouble` to the reason."""
         poses = await self._fetch_poses()
-        with contextlib.suppress(TrirailError):  # the old description remains in use until the service answers
+        try:
             await self._fetch_robot()
+        except (TrirailError, ValueError) as error:  # ValueError: a role or a drive of a later version
+            trouble = str(error) or type(error).__name__
+        else:
             self._publish("poses", poses)
-            self._is_described = True
+            trouble = ""
+        with self.changed:
+            self.trouble = trouble
+            self.changed.notify_all()
 
     async def _fetch_robot(self) -> None:
         """Query the description of the robot and the user's permissions, and publish the description to tabs.

@@ -202,7 +202,9 @@ class Tab:
     def _send(self) -> None:
         """Send pending messages and states until the tab closes; send states only as fast as the page draws them."""
         sent: dict[str, bytes] = {}
-        event, stamp, silent = 0, 0, False
+        event, stamp = 0, 0
+        silent: str | None = None
+        """Reason of the silence that was sent last; None if a state was sent since."""
         feed = self._feed
         while True:
             due: list[bytes] = []
@@ -217,11 +219,11 @@ class Tab:
                 due += self._outbox
                 self._outbox.clear()
                 if feed.state is None:
-                    if not silent:
-                        due.append(b'{"tell":"silent"}')
-                    silent = True
+                    if silent != feed.trouble:
+                        due.append(msgspec.json.encode({"tell": "silent", "trouble": feed.trouble}))
+                    silent = feed.trouble
                 elif feed.stamp != stamp and len(self._undrawn) < MAX_STATES_IN_TRANSIT:
-                    stamp, silent = feed.stamp, False
+                    stamp, silent = feed.stamp, None
                     self._undrawn.append(stamp)
                     due.append(feed.state)
                 if not self._open:

@@ -113,8 +113,8 @@ const takes = {
     commands.event(event);
     outputs.event(event, drawing);
   },
-  silent() {
-    lost("service");
+  silent({ trouble }) {
+    lost(trouble ? "description" : "service", trouble);
   },
   ended(told) {
     jogging.end();
@@ -174,11 +174,11 @@ setInterval(() => {
   if (contact && drawn && !document.hidden && performance.now() - heard > SILENT) lost("old");
 }, 250);
 
-function lost(why) {
+function lost(why, trouble = "") {
   jogging.end();
   contact = false;
   document.body.dataset.contact = "none";
-  readings.lost(say(`lost.${why}`));
+  readings.lost(say(`lost.${why}`, { trouble }));
   charts.lost();
   outputs.lost();
   line.clear();
