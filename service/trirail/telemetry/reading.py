@@ -141,8 +141,8 @@ def read_session(paths: Sequence[str | os.PathLike[str]]) -> Recording:
             errors.append(error)
     if not parts:
         raise errors[0]
-    for error in errors:
-        warnings.warn(f"{error}; this file is left out", SkippedFileWarning, stacklevel=2)
+    for each in errors:
+        warnings.warn(f"{each}; this file is left out", SkippedFileWarning, stacklevel=2)
     return join(parts)
 
 
