@@ -8,7 +8,7 @@ import pytest
 from chromium import Page, chromium
 from panel.fake_robot import FakeRobot
 from trirail.client import held_jog
-from trirail.panel import tab_requests
+from trirail.panel import feed
 from trirail.panel.server import Panel
 
 SHOWN = "document.body.dataset.contact === 'yes'"
@@ -28,7 +28,7 @@ def robot() -> FakeRobot:
 @pytest.fixture(autouse=True)
 def _slow_browser(monkeypatch: pytest.MonkeyPatch) -> None:
     """Accept what is pressed late: on a busy machine a browser draws a state when it is given the time for it."""
-    monkeypatch.setattr(tab_requests, "MAX_STATE_AGE_MS", 5000)
+    monkeypatch.setattr(feed, "MAX_STATE_AGE_S", 5.0)
 
 
 @pytest.fixture

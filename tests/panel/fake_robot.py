@@ -376,7 +376,10 @@ class AsyncFakeRobot:
     async def states(self, timeout: float) -> AsyncGenerator[State]:
         while not self._robot.silent.is_set():
             yield self._robot.state()
-            await asyncio.sleep(PERIOD)
+            period = 1.0 / self._robot.told.state_hz
+            await asyncio.sleep(min(period, timeout))
+            if period > timeout:
+                return
         assert timeout is not None
         await asyncio.sleep(PERIOD)
 

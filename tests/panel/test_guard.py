@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
-from trirail.panel import feed, tab_requests
+from trirail.panel import feed
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import MAX_MESSAGE, Panel, refused
 from trirail.telemetry.recorder import Recorder
@@ -427,7 +427,7 @@ def test_what_does_more_than_stop_is_refused_with_words_where_the_page_is_late(m
     """So is a press that a slow connection has held up. A stop is sent however late it is."""
     robot = FakeRobot()
     with Panel(robot.robot(), 0) as panel:
-        refused, stopped = replies(panel, robot, [message], tab_requests.MAX_STATE_AGE_MS + 1000)
+        refused, stopped = replies(panel, robot, [message], round(feed.MAX_STATE_AGE_S * 1000) + 1000)
         assert (refused["tell"], refused["code"]) == ("refused", "outdated")
         kinds = {"goal": message.get("goal", {}).get("kind"), "command": message.get("name")}
         assert refused["to"] == kinds.get(message["do"], message["do"])

@@ -13,7 +13,7 @@ from panel.fake_robot import FakeRobot
 from panel.test_gamepad import settle
 from panel.test_page import moves, small, stands, typed
 from trirail.errors import RefusalCode, RefusedError
-from trirail.panel import feed, tab_requests
+from trirail.panel import feed
 from trirail.panel.server import Panel
 from trirail.wire.state import DigitalLine, GoalState, Pose
 from trirail.wire.vocabulary import Command, Mode, Role
@@ -155,9 +155,8 @@ def test_a_pose_of_another_geometry_is_marked_and_asks_first(enabled: Page, robo
         "[...document.querySelectorAll('#poses button')].map((each) => each.innerText)",
         ["park", "new", "⚠ old", "⚠ older"],
     )
-    assert {"en": "another geometry", "de": "anderen Geometrie"}[language] in enabled.evaluate(
-        f"document.querySelector('{old}').title"
-    )
+    words = {"en": "another geometry", "de": "anderen Geometrie"}[language]
+    enabled.until(f"document.querySelector('{old}').title.includes({words!r})")
     for other in ("[data-pose=older]", "[data-pose=new]"):  # the answer is the second press on the same pose
         enabled.click(old)
         enabled.until(f"{ANSWER}.includes('old') && document.querySelector('{old}').classList.contains('asked')")
@@ -169,6 +168,29 @@ def test_a_pose_of_another_geometry_is_marked_and_asks_first(enabled: Page, robo
     enabled.click(old)
     wait_until(lambda: robot.gone_to == ["new", "old"], "the pose that asks")
     enabled.evaluate("localStorage.clear()")
+
+
+@pytest.mark.parametrize("state_hz", [1, 2])
+def test_contact_stays_and_the_robot_goes_where_states_are_rare(
+    browser: Page, robot: FakeRobot, state_hz: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed, "MAX_STATE_AGE_S", 0.5)
+    robot.mode, robot.told = "holding", msgspec.structs.replace(robot.told, state_hz=state_hz)
+    page = browser.another()
+    with Panel(robot.robot()) as panel:
+        page.open(panel.url)
+        page.until(SHOWN)
+        page.evaluate("window.lost = 0")
+        observed = "window.lost += document.body.dataset.contact === 'none'"
+        page.evaluate(f"new MutationObserver(() => {{ {observed}; }}).observe(document.body, {{ attributes: true }})")
+        pressed: list[str] = []
+        for _ in range(3):
+            time.sleep(0.8)
+            page.click("[data-pose=park]")
+            pressed.append("park")
+            wait_until(lambda: robot.gone_to == pressed, "it goes")
+        assert page.evaluate("window.lost") == 0
+        page.close()
 
 
 @pytest.mark.parametrize("language", ["en", "de"])
@@ -183,7 +205,7 @@ def test_what_is_pressed_on_a_page_that_is_late_is_refused_in_words(
     enabled.until("!document.querySelector('[data-command=resume]').disabled")
     enabled.choose("#language", language)
     enabled.until(f"document.documentElement.lang === {language!r}")
-    monkeypatch.setattr(tab_requests, "MAX_STATE_AGE_MS", -1)
+    monkeypatch.setattr(feed.Feed, "is_fresh", lambda *_: False)
     before, why = robot.pose, {"en": "the page showed no state", "de": "die Anzeige war nicht aktuell"}[language]
     enabled.click("[data-step='1']")
     enabled.write("#pose-name", "here")

@@ -65,7 +65,7 @@ REDRAW_S = 0.1
 STALL_S = 0.5
 """Length of a pause in this program after which buffered keys are discarded as stale [s]."""
 STATE_TIMEOUT_S = 1.0
-"""Time without a state after which the service counts as silent [s]."""
+"""Minimum time without a state after which the service counts as silent [s]."""
 AXES = {"right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0), "a": (0, 0, 1), "d": (0, 0, -1)}
 """Directions along x, y and φ."""
 HELP = "← → x   ↑ ↓ y   a d φ   + − speed   Space stop   q leave"
@@ -141,11 +141,15 @@ class Pendant:
 
 
 class _StateReader:
-    """Thread that reads the newest state until the context ends; `state` is None while the service is silent."""
+    """Thread that reads the newest state until the context ends; `state` is None while the service is silent.
 
-    def __init__(self, robot: Robot) -> None:
+    The service counts as silent after `timeout` [s] without a state.
+    """
+
+    def __init__(self, robot: Robot, timeout: float) -> None:
         self.state: State | None = None
         self._robot = robot
+        self._timeout = timeout
         self._over = False
         self._thread = threading.Thread(target=self._read_states, name="states", daemon=True)
 
@@ -159,7 +163,7 @@ class _StateReader:
 
     def _read_states(self) -> None:
         while not self._over:
-            for state in self._robot.states(STATE_TIMEOUT_S):
+            for state in self._robot.states(self._timeout):
                 if self._over:
                     return
                 self.state = state
@@ -176,9 +180,10 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
         raise ServiceError(
             "jogging with keys needs a terminal; without a terminal, use trirail jog VX VY W --seconds S"
         )
-    top = live.limits_of(robot.info()).platform.velocity
+    info = robot.info()
+    top = live.limits_of(info).platform.velocity
     pendant = Pendant(robot, top, tool)
-    with _StateReader(robot) as newest:
+    with _StateReader(robot, info.state_timeout(STATE_TIMEOUT_S)) as newest:
         try:
             with Live(console=terminal.out, auto_refresh=False, transient=True) as display, _raw(pendant):
                 _serve(pendant, newest, display)

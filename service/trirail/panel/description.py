@@ -17,6 +17,8 @@ from trirail.workspace.part_positions import RobotParts
 
 STAGE = 0.05
 """Maximum travel of the platform along x for which the page shows lengths in micrometres [m]."""
+STATE_TIMEOUT_S = 1.5
+"""Minimum time without a message after which the page counts the panel's server as silent [s]."""
 MICROMETRES: dict[str, Any] = {
     "unit": "µm",
     "scale": 1e6,
@@ -55,6 +57,7 @@ def describe(info: Info, robot: DrawnRobot, user: str, role: Role | None) -> dic
         "largest_file": MAX_FILE,
         "version": info.version,
         "lease": info.lease,
+        "state_timeout": info.state_timeout(STATE_TIMEOUT_S),
         "tools": robot.frames.tool,
         "frames": robot.frames.work,
         "velocity": platform.velocity,

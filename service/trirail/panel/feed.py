@@ -27,7 +27,11 @@ from trirail.wire.looks import AlignmentLook
 from trirail.wire.vocabulary import Role
 
 SILENCE_S = 1.0
-"""Time without a state after which the service counts as silent [s]."""
+"""Minimum time without a state after which the service counts as silent [s]."""
+MAX_STATE_AGE_S = 0.5
+"""Minimum of the limit of the age of the newest state on the page at which the page can move the robot [s].
+
+If the state is older, the page or its connection has stalled, and the operator pressed the button some time ago."""
 USERS_PERIOD_S = 2.0
 """Interval between queries of the connected users, and of a description that has not been answered [s]."""
 MAX_EVENTS = 200
@@ -82,6 +86,10 @@ class Feed:
         """Return the numbers and the JSON of the events with numbers higher than `after`, in order of arrival."""
         return [event for event in sorted({*self._alignment_events, *self._events}) if event[0] > after]
 
+    def is_fresh(self, seen: int) -> bool:
+        """Return whether the state with the stamp `seen` is new enough for a request that moves the robot."""
+        return now() - seen <= self._info.state_timeout(MAX_STATE_AGE_S) * 1e3
+
     def find_obstacle(self, goal: PoseGoal) -> Obstacle | None:
         """Return the obstacle between the measured pose and a goal; None if there is none.
 
@@ -99,7 +107,7 @@ class Feed:
     async def _receive_states(self) -> None:
         is_new = False
         while True:
-            async with aclosing(self._robot.states(SILENCE_S)) as states:
+            async with aclosing(self._robot.states(self._info.state_timeout(SILENCE_S))) as states:
                 async for state in states:
                     if is_new:  # a service that was silent may have restarted
                         await self._describe()
@@ -148,6 +156,7 @@ class Feed:
         robot = DrawnRobot.from_info(info)
         about = msgspec.json.encode(describe(info, robot, self._robot.user, role))
         self._robot_drawing = robot
+        self._info = info
         self.recordings = info.recordings
         """Folder of the service's recordings on the service's machine."""
         self.permissions = permissions(role, Role(info.takeover))

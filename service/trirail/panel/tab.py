@@ -27,7 +27,7 @@ from trirail.panel.messages import (
     SendCommand,
     StateDrawn,
 )
-from trirail.panel.tab_requests import OUTDATED, TabRequests, is_fresh, refusal
+from trirail.panel.tab_requests import OUTDATED, TabRequests, refusal
 from trirail.panel.uploads import UploadedFile, Uploads
 from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.goals import Goal
@@ -99,7 +99,7 @@ class Tab:
         self._outbox: deque[bytes] = deque(maxlen=MAX_ANSWERS)
         self._undrawn: deque[int] = deque()
         self._uploads = Uploads()
-        self._requests = TabRequests(robot, loop, self._enqueue, self._uploads)
+        self._requests = TabRequests(robot, loop, feed, self._enqueue, self._uploads)
         self._poses, self._paths = NewestTask("pose check"), NewestTask("path check")
         self._open = True
 
@@ -162,7 +162,7 @@ class Tab:
                 self._requests.begin(message)
 
     def _hold_jog(self, message: JogHeld) -> None:
-        if not is_fresh(message.seen) and not self._jog_refused:
+        if not self._feed.is_fresh(message.seen) and not self._jog_refused:
             self._jog_refused = True
             self._enqueue("ended", **OUTDATED)
         if not self._jog_refused:

@@ -14,17 +14,13 @@ from trirail.client.blocking import LoopThread
 from trirail.client.goal import AsyncGoalHandle
 from trirail.client.lease import AsyncLease
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
-from trirail.panel.feed import now
+from trirail.panel.feed import Feed
 from trirail.panel.messages import Follow, Forget, SendCommand, SendGoal, ServiceRequest, TakeOver, Teach
 from trirail.panel.uploads import UploadedFile, Uploads
 from trirail.wire.goals import kind_name
 from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import Command
 
-MAX_STATE_AGE_MS = 500
-"""Maximum age of the newest state on the page at which the page can do more than reduce motion [ms].
-
-If the state is older, the page or its connection has stalled, and the operator pressed the button some time ago."""
 MAX_PENDING = 8
 """Maximum number of unanswered requests of a tab.
 
@@ -49,9 +45,12 @@ class TabRequests:
     `send` is a function that sends the results of the requests to the page. `uploads` contains the tab's file.
     """
 
-    def __init__(self, robot: AsyncRobot, loop: LoopThread, send: MessageSender, uploads: Uploads) -> None:
+    def __init__(
+        self, robot: AsyncRobot, loop: LoopThread, feed: Feed, send: MessageSender, uploads: Uploads
+    ) -> None:
         self._robot = robot
         self._loop = loop
+        self._feed = feed
         self._reply = send
         self._uploads = uploads
         self._pending: Counter[str] = Counter()
@@ -77,7 +76,7 @@ class TabRequests:
         """
         kind, name, send = self._prepared(request)
         reduces = isinstance(request, SendCommand) and request.only_reduces_motion
-        if not reduces and not is_fresh(request.seen):
+        if not reduces and not self._feed.is_fresh(request.seen):
             self._reply("refused", to=kind, name=name, **OUTDATED)
         elif kind == Command.OVERRIDE:
             self._loop.start(self._set_override(send))
@@ -171,14 +170,9 @@ class TabRequests:
 
 OUTDATED = {
     "code": "outdated",
-    "message": f"the page showed no state of the last {MAX_STATE_AGE_MS / 1e3:g} s, so nothing was sent; press again",
+    "message": "the page showed no state that is new enough, so nothing was sent; press again",
 }
 """Fields of a message that refuses a request because the page or its connection has stalled."""
-
-
-def is_fresh(seen: int) -> bool:
-    """Return whether the state with the stamp `seen` is new enough for a request that does more than reduce motion."""
-    return now() - seen <= MAX_STATE_AGE_MS
 
 
 def refusal(error: TrirailError) -> dict[str, Any]:

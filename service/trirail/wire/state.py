@@ -238,6 +238,10 @@ class DigitalLine(Struct, frozen=True):
     """Bit in object 60FDh for an input, in object 60FEh for an output."""
 
 
+MISSED_STATES = 3
+"""Number of periods of the published states without a state after which the newest state is outdated."""
+
+
 class Info(Struct, frozen=True):
     """Description of the robot, in reply to …/info."""
 
@@ -285,6 +289,13 @@ class Info(Struct, frozen=True):
     """Drive and bit of each input; empty if the service is an earlier version."""
     takeover: str = Role.MAINTAINER.value
     """Lowest trirail.wire.vocabulary.Role that may take over the lease, from the key `takeover` in [control]."""
+
+    def state_timeout(self, shortest: float) -> float:
+        """Return the time without a state after which the newest state is outdated [s].
+
+        The time is `shortest` [s], or MISSED_STATES periods of the published states if that is longer.
+        """
+        return max(shortest, MISSED_STATES / self.state_hz)
 
 
 class NamedPose(Struct, frozen=True):

@@ -18,7 +18,6 @@ import { onLanguage, say } from "./words.js";
 
 const LEASED = { acquire: true, takeover: true, release: false }; // commands that take or give back the lease
 const SEEN = ["hold", "goal", "follow", "command", "takeover", "teach", "forget"]; // messages that carry the stamp of the newest state that was drawn
-const SILENT = 1500; // without a state for so long, what is shown is old [ms]
 const AGAIN = 500; // after so long a lost connection is tried again [ms]
 
 const LIGHT = matchMedia("(prefers-color-scheme: light)");
@@ -171,7 +170,7 @@ function draw() {
 }
 
 setInterval(() => {
-  if (contact && drawn && !document.hidden && performance.now() - heard > SILENT) lost("old");
+  if (contact && drawn && !document.hidden && performance.now() - heard > robot.state_timeout * 1e3) lost("old");
 }, 250);
 
 function lost(why, trouble = "") {
