@@ -15,6 +15,7 @@ from trirail.motion.limits import Bounds
 from trirail.motion.runs import centre_motion, rest
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.workspace.violations import violations
+from trirail_drivers.interface import Triple
 
 TIP, TABLE = (0.02, 0.03), (0.05, 0.02, 0.3)
 FRAMES = FramesTable(tool={"tip": TIP}, work={"table": TABLE})
@@ -77,14 +78,22 @@ def test_whatever_is_in_a_file_comes_to_an_answer(name: str, text: str, stretch:
     assert found.why or (found.duration > 0.0 and len(found.line) > 2)
 
 
-@given(st.lists(st.tuples(place, place, st.floats(-0.6, 0.6)), min_size=1, max_size=6), st.booleans())
-def test_a_path_that_is_called_free_stays_in_reach(poses: list[tuple[float, float, float]], stretch: bool) -> None:
-    lines = [f"{k},{x},{y},{phi}" for k, (x, y, phi) in enumerate([ZERO, *poses])]
+anywhere = st.tuples(place, place, st.floats(-0.6, 0.6))
+
+
+@given(st.one_of(st.just(ZERO), anywhere), st.lists(anywhere, max_size=6), st.integers(1, 3), st.booleans())
+def test_a_path_that_is_called_free_stays_in_reach(
+    first: Triple, others: list[Triple], standing: int, stretch: bool
+) -> None:
+    """Also one that stands still all the time or at first."""
+    poses = [first] * (standing + 1) + others
+    lines = [f"{k},{x},{y},{phi}" for k, (x, y, phi) in enumerate(poses)]
     found = check_path(ROBOT, "path.csv", "\n".join(["t,x,y,phi", *lines]), stretch)
     if found.why:
         return
-    assert found.line[0] == ZERO
+    assert np.allclose(found.line[0], first, atol=1e-9)
     assert np.allclose(found.line[-1], poses[-1], atol=1e-9)
     assert found.slowed == 1.0 or stretch
     for pose in found.line:
+        assert not BOUNDS.pose_violation(pose)
         assert not violations(ROBOT.geometry, ROBOT.limits, np.array(pose))

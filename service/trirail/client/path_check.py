@@ -13,7 +13,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.client import trajectory
 from trirail.client.outgoing import goal_messages
-from trirail.errors import KinematicsError, RefusedError, TrirailError
+from trirail.errors import KinematicsError, RefusalCode, RefusedError, TrirailError
 from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.limits import Bounds, Violation
 from trirail.motion.runs import centre_motion, nominal_motion, rest, tool_motion
@@ -119,7 +119,8 @@ class CheckedPath(Struct, frozen=True, omit_defaults=True):
 def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> CheckedPath:
     """Parse a trajectory, and plan it from its first point in the same way as the service.
 
-    The planner checks the whole path. `name` is the name of the file, and `stretch` is that of Robot.follow.
+    The planner checks the whole path after its first pose. `name` is the name of the file, and `stretch` is that of
+    Robot.follow.
     """
     line: list[Triple] = []
     try:
@@ -127,6 +128,7 @@ def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> Checke
         line = [(point.x, point.y, point.phi) for point in points]
         goal, period = TrajectoryGoal(points, stretch=stretch), 1.0 / robot.rate_hz
         goal_messages(goal, "checked")  # the checks of the client
+        _check_first_pose(robot, line[0])  # the planner lets a robot that is outside the limits stand or return
         planner, schedule = GoalPlanner(robot.geometry, robot.limits, period), Schedule(rest(line[0]), period)
         planned = planner.plan(packed(goal), schedule, 1.0, 0)
     except (TrirailError, ValueError) as error:
@@ -136,3 +138,13 @@ def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> Checke
     poses = [nominal_motion(path, float(s)).pose for s in np.linspace(0.0, path.duration, DRAWN_POINTS)]
     drawn = [(float(x), float(y), float(phi)) for x, y, phi in poses]
     return CheckedPath(line=drawn, duration=planned.duration, slowed=planned.reply.slowed)
+
+
+def _check_first_pose(robot: DrawnRobot, pose: Triple) -> None:
+    """Raise RefusedError if a pose is outside the limits, and KinematicsError if it cannot be reached."""
+    outside = Bounds(robot.limits, 1.0 / robot.rate_hz, labels=robot.geometry.labels).pose_violation(pose)
+    exceeded = [outside] if outside else violations(robot.geometry, robot.limits, pose)
+    if exceeded:
+        value, limit = exceeded[0].value, exceeded[0].limit
+        text = f"the first point is outside the limits: {exceeded[0]}"
+        raise RefusedError(RefusalCode.OUT_OF_WORKSPACE, text, value=value, limit=limit)
