@@ -171,7 +171,7 @@ def test_the_recordings_are_those_of_the_service_that_runs_now(tmp_path: Path) -
         robot.silent.clear()
         hear(panel)
         listed = msgspec.json.decode(ask(panel, f"{urlsplit(panel.url).path}sessions").read())
-    assert listed == {"folder": str(tmp_path), "here": False, "sessions": []}
+    assert listed == {"folder": str(tmp_path), "here": False, "sessions": [], "trouble": ""}
 
 
 def test_a_service_that_is_asked_before_it_can_answer_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:

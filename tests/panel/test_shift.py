@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
+import subprocess
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -19,6 +23,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.runs import centre_motion, rest, tool_motion
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import Panel
+from trirail.telemetry import contents
 from waiting import wait_until as wait
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
@@ -315,6 +320,44 @@ def test_sessions_are_listed_reported_and_downloaded(page: Page, panel: Panel, t
 def test_where_there_is_nothing_here_that_is_said(page: Page, robot: FakeRobot, tmp_path: Path) -> None:
     assert str(tmp_path) in sessions(page)
     assert "not on the panel's" in sessions(page)
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize("failure", ["error", "timeout", "no permission", "no answer"])
+def test_a_list_that_cannot_be_made_is_never_called_empty(
+    page: Page, robot: FakeRobot, tmp_path: Path, language: str, failure: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(tmp_path)
+    page.choose("#language", language)
+
+    def fail(*_: object, **__: object) -> Any:
+        if failure == "timeout":
+            raise subprocess.TimeoutExpired("trirail", 300.0)
+        if failure == "error":
+            return subprocess.CompletedProcess([], 2, b"", b"trirail: no memory")
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    if failure == "no answer":
+        page.evaluate("window.fetch = () => Promise.reject(new Error('broken'))")
+    else:
+        monkeypatch.setattr(*((os, "listdir") if failure == "no permission" else (subprocess, "run")), fail)
+    shown = sessions(page)
+    why = {"error": "no memory", "timeout": "longer than 300 s", "no permission": "Permission", "no answer": "broken"}
+    assert {"en": "cannot be listed", "de": "nicht auflisten"}[language] in shown
+    assert why[failure] in shown
+    page.evaluate("localStorage.clear()")
+
+
+def test_a_session_in_which_the_clock_was_set_back_has_no_duration(page: Page, tmp_path: Path) -> None:
+    recorded = record(tmp_path)
+    kept = contents.load(recorded)
+    assert kept is not None
+    assert kept.began is not None
+    contents.save(recorded, msgspec.structs.replace(kept, ended=kept.began - 3641.0, lost_cycles=17))
+    assert recorded.name in sessions(page)
+    row = f"[...document.querySelectorAll('#sessions tr')].find((row) => row.innerText.includes({recorded.name!r}))"
+    assert page.evaluate(f"{row}.cells[1].innerText") == "–"
+    assert "Not recorded: 17 cycles." in page.evaluate(f"{row}.innerText")
 
 
 @given(st.text())

@@ -18,6 +18,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 from websockets.sync.server import ServerConnection
 
+from trirail.errors import ServiceError
 from trirail.processes.operating_system import python
 from trirail.telemetry.sessions import RecordedSession
 from trirail.wire.decoding import decoded, prepare
@@ -65,16 +66,22 @@ class Recordings:
         """Return the list of sessions for the page, as values that can be encoded as JSON.
 
         `folder` is the folder, `here` is True if the folder on this machine contains recordings, and `sessions` are
-        the sessions, newest first.
+        the sessions, newest first. `trouble` is the reason why they cannot be listed, or empty.
         """
-        return {"folder": str(self._folder), "here": self._here, "sessions": self._sessions()[: -MAX_SESSIONS - 1 : -1]}
+        content: dict[str, Any] = {"folder": str(self._folder), "here": True, "sessions": [], "trouble": ""}
+        try:
+            content["here"] = self._here
+            content["sessions"] = self._sessions()[: -MAX_SESSIONS - 1 : -1]
+        except ServiceError as error:
+            content["trouble"] = str(error)
+        return content
 
     def send_file(self, opened: ServerConnection, name: str, headers: dict[str, str]) -> Response | None:
         """Send a recording of any size as a download.
 
         Return None, without sending anything, if the recording is not a regular file in the folder.
         """
-        if not self._here or "/" in name or not name.endswith(".rrd"):
+        if "/" in name or not name.endswith(".rrd"):
             return None
         try:
             file = open(self._folder / name, "rb", opener=_open_here)  # noqa: SIM115
@@ -98,11 +105,14 @@ class Recordings:
 
         Return None if the session does not exist.
         """
-        files = next((each.files for each in self._sessions() if each.session == session), None)
-        if files is None or not all(stat.S_ISREG((self._folder / name).lstat().st_mode) for name in files):
-            return None
-        with self._one_report:
-            done = self._run("report", *files)
+        try:
+            files = next((each.files for each in self._sessions() if each.session == session), None)
+            if files is None or not all(stat.S_ISREG((self._folder / name).lstat().st_mode) for name in files):
+                return None
+            with self._one_report:
+                done = self._run("report", *files)
+        except ServiceError as error:
+            return str(error)
         return (done.stderr + done.stdout).decode(errors="replace")
 
     @property
@@ -111,20 +121,35 @@ class Recordings:
 
     @property
     def _here(self) -> bool:
-        return any(self._folder.glob("*.rrd"))
+        """True if the folder on this machine contains recordings. Raises ServiceError if it cannot be listed."""
+        try:
+            return any(name.endswith(".rrd") for name in os.listdir(self._folder))
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except OSError as error:
+            raise ServiceError(f"{self._folder}: {error.strerror}") from error
 
     def _sessions(self) -> list[RecordedSession]:
+        """Return all sessions, the newest last. Raises ServiceError if they cannot be listed."""
         if not self._here:
             return []
         done = self._run("sessions", ".", "--robot", self._robot, "--last", "0", "--json")
-        return decoded(done.stdout, _SessionList).sessions if done.returncode == 0 else []
+        if done.returncode != 0:
+            raise ServiceError(done.stderr.decode(errors="replace").strip() or f"exit code {done.returncode}")
+        return decoded(done.stdout, _SessionList).sessions
 
     def _run(self, *command: str) -> subprocess.CompletedProcess[bytes]:
         """Run a `trirail` command in the folder.
 
-        The command has a low priority, because the page may move a robot at the same time.
+        The command has a low priority, because the page may move a robot at the same time. Raises ServiceError if the
+        command cannot be run, or does not end within REPORT_TIMEOUT_S.
         """
-        return subprocess.run(
-            ["nice", *python("-m", "trirail", *command)], cwd=self._folder, capture_output=True,
-            timeout=REPORT_TIMEOUT_S, check=False, env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},
-        )  # fmt: skip
+        try:
+            return subprocess.run(
+                ["nice", *python("-m", "trirail", *command)], cwd=self._folder, capture_output=True,
+                timeout=REPORT_TIMEOUT_S, check=False, env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},
+            )  # fmt: skip
+        except subprocess.TimeoutExpired as error:
+            raise ServiceError(f"trirail {command[0]} took longer than {REPORT_TIMEOUT_S:g} s") from error
+        except OSError as error:
+            raise ServiceError(f"trirail {command[0]} cannot be run: {error}") from error

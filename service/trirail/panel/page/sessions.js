@@ -15,15 +15,16 @@ export class Sessions {
   async ask() {
     try {
       this.told = await (await fetch("sessions")).json();
-    } catch {
-      this.told = null;
+    } catch (error) {
+      this.told = { folder: "", trouble: String(error) };
     }
     this.#show();
   }
 
   #show() {
     if (this.told === null) return byId("sessions").replaceChildren();
-    const { folder, here, sessions } = this.told;
+    const { folder, here, sessions, trouble } = this.told;
+    if (trouble) return byId("sessions").replaceChildren(say("sessions.trouble", { folder }), " ", quoted(trouble));
     if (!here || !sessions.length)
       return byId("sessions").replaceChildren(say(here ? "sessions.none" : "sessions.elsewhere"), " ", quoted(folder));
     const table = document.createElement("table");
@@ -35,14 +36,14 @@ export class Sessions {
   }
 }
 
-function row(made, { session, began, ended, goals, faults, files, reason, trouble, running }) {
+function row(made, { session, began, ended, goals, faults, files, reason, trouble, running, lost_cycles: lost }) {
   const counts = Object.entries(goals).map(([outcome, times]) => `${times} ${outcome}`).join(", ");
   const wrong = [trouble ?? reason ?? faults[0] ?? "", !reason && faults.length > 1 ? ` (+${faults.length - 1})` : ""].join("");
   made.append(
     cell("td", quoted(began === null ? "–" : date(began))),
     cell("td", quoted(began === null || ended === null ? "–" : lasted(ended - began)), running ? ` ${say("sessions.running")}` : ""),
     cell("td", quoted(counts || "–")),
-    cell("td", reason && !trouble ? `${say("sessions.black_box")} ` : "", quoted(wrong || "–")),
+    cell("td", reason && !trouble ? `${say("sessions.black_box")} ` : "", quoted(wrong || "–"), lost ? ` ${say("sessions.lost", { lost })}` : ""),
     cell("td", link(say("sessions.report"), `report/${encodeURIComponent(session)}`), ...files.flatMap((name) => [" ", saved(name)])),
   );
 }
@@ -71,6 +72,7 @@ function saved(name) {
 }
 
 function lasted(seconds) {
+  if (seconds < 0) return "–"; // the clock was set back
   const [hours, minutes, rest] = [seconds / 3600, (seconds / 60) % 60, seconds % 60].map(Math.floor);
   return `${hours}:${String(minutes).padStart(2, "0")}:${String(rest).padStart(2, "0")}`;
 }
