@@ -146,3 +146,12 @@ def test_the_share_of_the_time_that_the_bus_leaves_fits_a_narrow_terminal() -> N
     with console.capture() as captured:
         console.print(live.table(msgspec.structs.replace(state, loop=late), "demo", NAMES, LIMITS))
     assert "p50 12%, p99.9 146%, worst 1977% of the 500 µs that the bus leaves" in captured.get()
+
+
+@pytest.mark.parametrize("homed", [(True, True, True), (True, False, True), (False, False, False)])
+def test_a_position_that_is_not_homed_is_not_shown_as_measured(homed: tuple[bool, bool, bool]) -> None:
+    state = a_state()
+    lines = printed(msgspec.structs.replace(state, sliders=msgspec.structs.replace(state.sliders, homed=homed)))
+    assert ("not homed" in lines["measured"]) is not all(homed)
+    for known, name in zip(homed, NAMES, strict=True):
+        assert lines[f"slider {name}"].startswith("not homed") is not known

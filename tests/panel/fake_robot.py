@@ -69,6 +69,7 @@ class FakeRobot:
         self.velocity: Triple = ZERO
         self.goal: GoalState | None = None
         self.faults: tuple[str, ...] = ()
+        self.homed = (True, True, True)
         self.share = 1.0
         self.holder: str | None = None
         self.granted: Role | None = Role.MAINTAINER
@@ -277,7 +278,7 @@ class FakeRobot:
         a, b, c = (float(value) for value in found.position)
         counts = FrameCounts(0, 0, 0, 0)
         power = "switch on disabled" if self.mode in ("disabled", "fault") else "operation enabled"
-        sliders = Sliders((a, b, c), ZERO, ZERO, ZERO, (power,) * 3, (counts,) * 3)
+        sliders = Sliders((a, b, c), ZERO, ZERO, ZERO, (power,) * 3, (counts,) * 3, self.homed)
         commanded = CommandedMotion(Pose(*self.pose), self.velocity, ZERO, (a, b, c), ZERO, ZERO)
         seq = self._seq()
         return State(

@@ -194,6 +194,25 @@ def test_contact_stays_and_the_robot_goes_where_states_are_rare(
 
 
 @pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize("homed", [(True, True, False), (False, True, True), (False, False, False)])
+def test_a_position_that_is_not_homed_is_not_shown_as_measured(
+    page: Page, robot: FakeRobot, homed: tuple[bool, bool, bool], language: str
+) -> None:
+    page.choose("#language", language)
+    drawn = "document.querySelector('.platform').getBoundingClientRect().width > 0"
+    cells = "[...document.querySelectorAll('#{} tr')].map((row) => row.cells[1].innerText)"
+    page.until(f"{drawn} && {cells.format('sliders')}[0].includes('mm')")
+    robot.homed, words = homed, {"en": "not homed", "de": "nicht referenziert"}[language]
+    page.until(f"!({drawn})")
+    assert page.evaluate(cells.format("pose")) == [words] * 3
+    for known, cell in zip(homed, page.evaluate(cells.format("sliders")), strict=True):
+        assert (cell == words, "mm" in cell) == (not known, known)
+    robot.homed = (True, True, True)
+    page.until(f"{drawn} && !document.querySelector('#numbers').innerText.includes({words!r})")
+    page.evaluate("localStorage.clear()")
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
 def test_what_is_pressed_on_a_page_that_is_late_is_refused_in_words(
     enabled: Page, robot: FakeRobot, language: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

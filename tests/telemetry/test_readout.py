@@ -34,6 +34,7 @@ def test_it_says_mode_goal_pose_sliders_and_what_is_wrong() -> None:
     record["pose"] = 0.0123456, -0.02, np.radians(12.5)
     record["position"] = 0.001, -0.0025, 0.1
     record["progress"], record["remaining"] = 0.4, 0.71
+    record["homed"] = True
     said = readout.markdown(record, ReadoutState("g-1", (0.03, 0.0, 0.5), 0.5, "drive B: EMCY 8700"))
     assert "**FAULT**   override 50%   goal **g\\-1**: 40%, 0.7 s left" in said
     assert "40%, waits on its path" in readout.markdown(record, ReadoutState("g-1", override=0.0))
@@ -44,6 +45,8 @@ def test_it_says_mode_goal_pose_sliders_and_what_is_wrong() -> None:
     assert "| measured | 12.346 | -20.000 | 12.500 | λ [mm] | 1.000 | -2.500 | 100.000 |" in said
     assert "| goal | 30.000 | 0.000 | 28.648 |" in said
     assert "| goal | – | – | – |" in readout.markdown(record, ReadoutState())
+    record["homed"] = True, False, True
+    assert "| measured | – | – | – | λ [mm] | 1.000 | not homed | 100.000 |" in readout.markdown(record, ReadoutState())
 
 
 WORDS = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1)

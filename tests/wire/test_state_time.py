@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 from control_rig import CONFIG
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from trirail.processes.publications import StateMaker
 from trirail.wire.packets import Welcome
 from trirail.wire.records import DTYPE, Part
+from trirail.wire.state import State
 
 
 def test_a_state_has_the_wall_clock_time_of_its_cycle() -> None:
@@ -23,6 +25,17 @@ def test_a_state_has_the_wall_clock_time_of_its_cycle() -> None:
     assert times == [1_700_000_005.01, 1_700_000_005.03]
     offset_ns += 3_600_000_000_000  # the clock is set
     assert maker.newest().time == 1_700_003_605.03
+
+
+@given(st.tuples(st.booleans(), st.booleans(), st.booleans()))
+def test_a_state_says_which_positions_are_known(homed: tuple[bool, bool, bool]) -> None:
+    maker, rows = StateMaker(CONFIG), np.zeros(1, DTYPE)
+    rows["homed"] = homed
+    maker.records(rows)
+    assert maker.newest().sliders.homed == homed
+    encoded = msgspec.to_builtins(maker.newest())
+    del encoded["sliders"]["homed"]
+    assert msgspec.convert(encoded, State).sliders.homed == (True, True, True)  # as earlier versions send it
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 10**6)), min_size=1, max_size=40))

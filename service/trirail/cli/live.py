@@ -132,7 +132,8 @@ def table(state: State, robot: str, labels: Labels, limits: Limits | None = None
         grid.add_row("lease", f"held by {plain(state.lease)}")
     if state.goal:
         _add_goal(grid, state, state.goal)
-    grid.add_row("measured", notation.pose(state.pose, 9))
+    homed = all(state.sliders.homed)
+    grid.add_row("measured", notation.pose(state.pose, 9) if homed else "[yellow]unknown: not homed[/]")
     grid.add_row("commanded", notation.pose(state.commanded.pose, 9))
     _add_sliders(grid, state, labels)
     for words in near_limits(state, limits, labels) if limits else ():
@@ -202,7 +203,7 @@ def _add_sliders(grid: Table, state: State, labels: Labels) -> None:
     sliders = state.sliders
     for index, name in enumerate(labels):
         written = (
-            notation.written(sliders.position[index], "mm", 3, 9),
+            notation.written(sliders.position[index], "mm", 3, 9) if sliders.homed[index] else "[yellow]not homed[/]",
             f"commanded {notation.written(state.commanded.position[index], 'mm', 3, 9)}",
             f"error {notation.written(sliders.following_error[index], 'µm', 1, 7)}",
             notation.written(sliders.velocity[index], "mm/s", 2, 8),

@@ -199,6 +199,7 @@ class StateMaker:
                 following_error_max=_triple(self._error_max),
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
                 traffic=(FrameCounts(*a), FrameCounts(*b), FrameCounts(*c)),
+                homed=tuple((row["homed"] != 0).tolist()),
             ),
             goal=GoalState(
                 goal, float(row["progress"]), float(row["remaining"]), target and Pose(*target), self._status.lag

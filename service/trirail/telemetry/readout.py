@@ -20,6 +20,9 @@ _TABLE_HEAD = "| | x [mm] | y [mm] | φ [°] | | {} | {} | {} |"
 _TABLE_RULE = f"|---|{'--:|' * 3}---|{'--:|' * 3}"
 
 
+_UNKNOWN = ["–"] * 3
+
+
 class ReadoutState(NamedTuple):
     """State that the readout shows in addition to the record. It is valid until it is updated."""
 
@@ -42,10 +45,11 @@ def markdown(record: np.void, state: ReadoutState, names: Labels = NAMES) -> str
         words = "waits on its path" if waits else f"{left:.1f} s left"
         head += f"   goal **{state.goal.translate(_ESCAPES)}**: {share:.0%}, {words}"
     wrong = [f"**{state.fault.translate(_ESCAPES)}**"] if state.fault else []
-    target = ["–"] * 3 if state.target is None else _pose(state.target)
-    place = slider_positions(record)
+    target = _UNKNOWN if state.target is None else _pose(state.target)
+    place = zip(slider_positions(record), record["homed"], strict=True)
+    positions = [f"{value * 1e3:.3f}" if homed else "not homed" for value, homed in place]
     rows = [
-        ("measured", *_pose(record["pose"]), "λ [mm]", *(f"{value * 1e3:.3f}" for value in place)),
+        ("measured", *(_pose(record["pose"]) if record["homed"].all() else _UNKNOWN), "λ [mm]", *positions),
         ("commanded", *_pose(record["commanded_pose"]), "v [mm/s]", *(f"{v * 1e3:.1f}" for v in record["velocity"])),
         ("goal", *target, "error [µm]", *(f"{value * 1e6:.0f}" for value in record["following_error"])),
     ]

@@ -71,6 +71,8 @@ class Sliders(Struct, frozen=True):
     """Power states of the drives, with the names of CiA 402."""
     traffic: tuple[FrameCounts, FrameCounts, FrameCounts]
     """Late and lost frames of each drive."""
+    homed: tuple[bool, bool, bool] = (True, True, True)
+    """Whether the absolute positions are known. If one is unknown, so is the pose. Earlier versions send no value."""
 
 
 class GoalState(Struct, frozen=True):

@@ -104,6 +104,7 @@ export class Drawing {
   }
 
   show(state) {
+    this.svg.classList.toggle("unknown", !state.sliders.homed.every(Boolean));
     place(this.platform, state.pose);
     const target = state.goal?.target;
     this.goal.style.display = target ? "" : "none";

@@ -47,12 +47,13 @@ export class Readings {
     warn(warnings);
     this.alarm(faults.length ? say("fault") : "", faults, faults.length ? say("fault.remedy") : "");
     const shown = (value, k) => (k < 2 ? length(value) : angle(value));
+    const homed = sliders.homed.every(Boolean); // without one position the pose is unknown
     this.pose.forEach(([measured, target], k) => {
-      text(measured, shown(pose[k], k));
+      text(measured, homed ? shown(pose[k], k) : say("not_homed"));
       text(target, goal?.target ? shown(goal.target[k], k) : "–");
     });
     this.sliders.forEach(([position, speed], k) => {
-      text(position, length(sliders.position[k]));
+      text(position, sliders.homed[k] ? length(sliders.position[k]) : say("not_homed"));
       text(speed, velocity(sliders.velocity[k]));
     });
   }
