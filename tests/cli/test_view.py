@@ -27,6 +27,7 @@ from rerun.chunk import Chunk, RrdReader
 from trirail.cli import remote_view, view
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
+from trirail.processes import operating_system
 from trirail.processes.publications import info
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
@@ -184,6 +185,29 @@ def test_reruns_programs_are_told_to_send_no_analytics() -> None:
         asked = [sys.executable, "-m", "rerun_cli", "analytics", "config"]
         told = subprocess.run(asked, env=environment, capture_output=True, check=True)
         assert msgspec.json.decode(told.stdout)["analytics_enabled"] is False
+
+
+@pytest.mark.parametrize(("machine", "remote"), [("another", True), (operating_system.machine(), False), ("", False)])
+def test_through_a_tunnel_the_view_is_that_of_the_service_s_machine(
+    machine: str, remote: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another robot's live view may be served on this machine at the same address."""
+
+    @contextmanager
+    def service(*_: Any, **__: Any) -> Iterator[Any]:
+        yield SimpleNamespace(info=lambda: msgspec.structs.replace(info(load(SIM)), machine=machine, live=live))
+
+    @contextmanager
+    def drawn_here(*_: Any) -> Iterator[Any]:
+        yield SimpleNamespace(url="drawn here", ended=threading.Event(), robots=[SimpleNamespace(restarted=False)])
+
+    monkeypatch.setattr(view, "Robot", service)
+    monkeypatch.setattr(view, "credentials_for", lambda *_: None)
+    monkeypatch.setattr(remote_view, "RemoteView", drawn_here)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        live = f"rerun+http://127.0.0.1:{server.getsockname()[1]}/proxy"
+        with view._source(None, ["demo"], "tcp/127.0.0.1:7447", None, records=False) as (source, _):
+            assert source == ("drawn here" if remote else live)
 
 
 @pytest.mark.parametrize("names", [["demo"], ["left", "right"]])

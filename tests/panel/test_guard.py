@@ -226,6 +226,22 @@ def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:
     assert session.session in str(recordings.report(session.session))
 
 
+def test_recordings_of_a_service_on_another_machine_are_not_looked_for_here(tmp_path: Path) -> None:
+    """The same folder here may contain recordings of another robot with the same name."""
+    recorder = Recorder(load(SIM), tmp_path, live=False, sidecars=True)
+    recorder.records(made.records(0.1).tobytes())
+    recorder.close()
+    robot = FakeRobot()
+    path = f"recording/{recorder.path.name}", f"report/{recorder.path.stem}"
+    for machine, here in (("another", False), (robot.told.machine, True), ("", True)):
+        robot.told = msgspec.structs.replace(robot.told, recordings=str(tmp_path), machine=machine)
+        with Panel(robot.robot(), 0) as panel:
+            begin = urlsplit(panel.url).path
+            listed = msgspec.json.decode(ask(panel, f"{begin}sessions").read())
+            assert (listed["here"], bool(listed["sessions"])) == (here, here)
+            assert [ask(panel, f"{begin}{each}").status for each in path] == [200 if here else 404] * 2
+
+
 def test_a_report_says_which_file_of_the_session_is_left_out(tmp_path: Path) -> None:
     recorder = Recorder(load(SIM), tmp_path, live=False, sidecars=True)
     recorder.records(made.records(0.1).tobytes())

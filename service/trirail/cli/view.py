@@ -21,7 +21,7 @@ from trirail_drivers import files
 
 from trirail.client.client import Robot
 from trirail.errors import ServiceError
-from trirail.processes.operating_system import python
+from trirail.processes.operating_system import is_here, python
 from trirail.telemetry.sinks import LOOPBACK, free_port
 from trirail.wire.credentials import credentials_for
 from trirail.wire.endpoints import is_local
@@ -93,7 +93,7 @@ def _source(
     for robot in dict.fromkeys(robots):
         with Robot(robot, connect, tls=tls) as service:
             infos.append(service.info())
-    if records or len(infos) > 1 or not is_local(connect):
+    if records or len(infos) > 1 or not (is_local(connect) and is_here(infos[0].machine)):
         from trirail.cli.remote_view import RemoteView
 
         with RemoteView(infos, connect, credentials_for(robots[0], connect, tls)) as drawn:

@@ -21,6 +21,7 @@ from trirail.client.path_check import CheckedPath, Obstacle
 from trirail.errors import TrirailError
 from trirail.panel.description import describe
 from trirail.panel.permissions import permissions
+from trirail.processes.operating_system import is_here
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.goals import PoseGoal
 from trirail.wire.looks import AlignmentLook
@@ -159,6 +160,8 @@ class Feed:
         self._info = info
         self.recordings = info.recordings
         """Folder of the service's recordings on the service's machine."""
+        self.is_here = is_here(info.machine)
+        """Whether the service runs on the panel's machine."""
         self.permissions = permissions(role, Role(info.takeover))
         """Permissions of the panel's user."""
         self._publish("robot", about)

@@ -54,12 +54,14 @@ prepare(_SessionList)
 class Recordings:
     """Recordings of one robot.
 
-    `folder` returns their folder, which another configuration of the service may change.
+    `folder` returns their folder, which another configuration of the service may change. `is_here` returns whether the
+    service runs on this machine. The same folder on another machine may contain recordings of another robot.
     """
 
-    def __init__(self, robot: str, folder: Callable[[], str]) -> None:
+    def __init__(self, robot: str, folder: Callable[[], str], is_here: Callable[[], bool] = lambda: True) -> None:
         self._robot = robot
         self._find_folder = folder
+        self._is_here = is_here
         self._one_report = threading.Lock()
 
     def listed(self) -> dict[str, Any]:
@@ -81,7 +83,7 @@ class Recordings:
 
         Return None, without sending anything, if the recording is not a regular file in the folder.
         """
-        if "/" in name or not name.endswith(".rrd"):
+        if not self._is_here() or "/" in name or not name.endswith(".rrd"):
             return None
         try:
             file = open(self._folder / name, "rb", opener=_open_here)  # noqa: SIM115
@@ -123,7 +125,7 @@ class Recordings:
     def _here(self) -> bool:
         """True if the folder on this machine contains recordings. Raises ServiceError if it cannot be listed."""
         try:
-            return any(name.endswith(".rrd") for name in os.listdir(self._folder))
+            return self._is_here() and any(name.endswith(".rrd") for name in os.listdir(self._folder))
         except (FileNotFoundError, NotADirectoryError):
             return False
         except OSError as error:

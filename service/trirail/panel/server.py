@@ -116,7 +116,7 @@ class Panel:
             self._opened = opened.pop_all()
         self._token = token or secrets.token_urlsafe(16)
         self._files = dict(_files())
-        self._recordings = Recordings(robot.name, lambda: self._feed.recordings)
+        self._recordings = Recordings(robot.name, lambda: self._feed.recordings, lambda: self._feed.is_here)
         self.url = f"http://{LOOPBACK}:{listening.getsockname()[1]}/{self._token}/"
         """Address of the page. Every program on this machine that knows the address can move the robot."""
         self._server: Server = serve(

@@ -6,6 +6,7 @@ Notifications are sent only if systemd has requested them. They follow sd_notify
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import signal
 import socket
@@ -32,6 +33,28 @@ ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "M
 
 A fork would not copy the threads, and threads would not be faster, because the matrices are small.
 """
+MACHINE_FILES: Final = (Path("/proc/sys/kernel/random/boot_id"), Path("/etc/machine-id"))
+"""Files that identify the present start of this machine, and its file system."""
+
+
+def machine() -> str:
+    """Return an identifier of this machine until its next start; "" if the operating system has none.
+
+    The identifier is a hash, because the id of a machine is confidential: machine-id(5). A container with its own file
+    system counts as another machine.
+    """
+    try:
+        start, *others = (file.read_bytes() if file.exists() else b"" for file in MACHINE_FILES)
+    except OSError:
+        return ""
+    return hashlib.sha256(b"trirail\0".join((start, *others))).hexdigest()[:16] if start else ""
+
+
+def is_here(named: str) -> bool:
+    """Return whether `named` identifies this machine; "" is an unknown machine, and counts as this one."""
+    return named in ("", machine())
+
+
 TITLE = "trirail: "
 """Prefix of the names of the service's processes, as shown by `ps` and similar programs."""
 

@@ -15,6 +15,7 @@ from trirail_drivers.interface import NAMES, PowerState, Triple
 from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_advanced_publisher
 
 from trirail.config import Config, as_built, geometry
+from trirail.processes.operating_system import machine
 from trirail.telemetry.provenance import software, versions
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import Event
@@ -264,6 +265,7 @@ def info(config: Config) -> Info:
     return Info(
         robot=config.robot.name,
         version=software().trirail,
+        machine=machine(),
         geometry=tuple(legs),
         mechanism=config.geometry.kind,
         labels=config.geometry.labels,

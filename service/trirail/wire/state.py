@@ -291,6 +291,8 @@ class Info(Struct, frozen=True):
     """Drive and bit of each input; empty if the service is an earlier version."""
     takeover: str = Role.MAINTAINER.value
     """Lowest trirail.wire.vocabulary.Role that may take over the lease, from the key `takeover` in [control]."""
+    machine: str = ""
+    """Identifier of the service's machine until its next start; "" if unknown, as with an earlier version."""
 
     def state_timeout(self, shortest: float) -> float:
         """Return the time without a state after which the newest state is outdated [s].
