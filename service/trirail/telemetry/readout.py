@@ -20,7 +20,7 @@ _TABLE_HEAD = "| | x [mm] | y [mm] | φ [°] | | {} | {} | {} |"
 _TABLE_RULE = f"|---|{'--:|' * 3}---|{'--:|' * 3}"
 
 
-_UNKNOWN = ["–"] * 3
+_NO_POSE = ["–"] * 3
 
 
 class ReadoutState(NamedTuple):
@@ -45,11 +45,11 @@ def markdown(record: np.void, state: ReadoutState, names: Labels = NAMES) -> str
         words = "waits on its path" if waits else f"{left:.1f} s left"
         head += f"   goal **{state.goal.translate(_ESCAPES)}**: {share:.0%}, {words}"
     wrong = [f"**{state.fault.translate(_ESCAPES)}**"] if state.fault else []
-    target = _UNKNOWN if state.target is None else _pose(state.target)
+    target = _NO_POSE if state.target is None else _pose(state.target)
     place = zip(slider_positions(record), record["homed"], strict=True)
     positions = [f"{value * 1e3:.3f}" if homed else "not homed" for value, homed in place]
     rows = [
-        ("measured", *(_pose(record["pose"]) if record["homed"].all() else _UNKNOWN), "λ [mm]", *positions),
+        ("measured", *(_pose(record["pose"]) if record["homed"].all() else _NO_POSE), "λ [mm]", *positions),
         ("commanded", *_pose(record["commanded_pose"]), "v [mm/s]", *(f"{v * 1e3:.1f}" for v in record["velocity"])),
         ("goal", *target, "error [µm]", *(f"{value * 1e6:.0f}" for value in record["following_error"])),
     ]
