@@ -31,7 +31,7 @@ from trirail.telemetry import contents
 from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.readout import ReadoutState
-from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.recorder import MAX_UNWRITTEN, Recorder
 from trirail.telemetry.rotation import RotatedFiles
 from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, is_watched
 from trirail.telemetry.streams import Streams
@@ -238,6 +238,21 @@ def test_a_batch_that_a_slow_disk_writes_late_is_not_written_twice() -> None:
     stream.stuck = False
     archive.write_chunks([first, second])  # type: ignore[list-item]
     assert stream.chunks == [first, second]
+
+
+def test_many_inputs_on_a_full_disk_displace_no_event(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = namedtuple("usage", "free")
+    recording, sent = recorder(tmp_path), made.records(1.0)
+    with monkeypatch.context() as full:
+        full.setattr(shutil, "disk_usage", lambda _: usage(free=0))
+        recording.event(Event("fault", "error", "drive B", seq=1, t=0.1, cycle=100, time=1.8e9))
+        recording.save()
+        for seq in range(MAX_UNWRITTEN + 1):
+            recording.control_input(ControlInput(seq, 10, made.MONOTONIC_NS, PlannerLost("late")))
+            recording.save()
+    feed(recording, sent)
+    recording.close()
+    assert ("ERROR", "drive B") in lines(recording.path)
 
 
 @pytest.mark.parametrize("fails", ["before", "at that moment", "at the end"])

@@ -153,6 +153,7 @@ def test_contents_list_what_was_written_and_events_are_written_when_the_disk_has
             for start in range(0, SECOND, 50):
                 time.ns = int(records[start : start + 50]["deadline_ns"][-1])
                 recording.records(records[start : start + 50].tobytes())
+                recording.control_input(asked(start, "ann"))
                 recording.save()
             for seq in [seq for seq, at in enumerate(faults) if at == number]:
                 now, fault = time.wall() * 1e-9 + seq, FaultDetail("emcy", "B", 0x8700 + seq)

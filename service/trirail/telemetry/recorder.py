@@ -249,9 +249,11 @@ class Recorder:
         Events that cannot be written are kept, and are written again with each later batch until they are written.
         """
         inputs: list[ControlInput] = []
-        if any(chunk.entity_path in (EVENTS, REQUESTS) for chunk in chunks):
-            self._unwritten.append(([chunk for chunk in chunks if chunk.entity_path == EVENTS], self._events))
-            inputs, self._inputs, self._events = self._inputs, [], []
+        if any(chunk.entity_path == REQUESTS for chunk in chunks):
+            inputs, self._inputs = self._inputs, []
+        if new := [chunk for chunk in chunks if chunk.entity_path == EVENTS]:
+            self._unwritten.append((new, self._events))
+            self._events = []
         kept = [chunk for events, _ in self._unwritten for chunk in events]
         if not self._write([*kept, *(chunk for chunk in chunks if chunk.entity_path != EVENTS)]):
             return
