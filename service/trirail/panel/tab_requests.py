@@ -45,9 +45,7 @@ class TabRequests:
     `send` is a function that sends the results of the requests to the page. `uploads` contains the tab's file.
     """
 
-    def __init__(
-        self, robot: AsyncRobot, loop: LoopThread, feed: Feed, send: MessageSender, uploads: Uploads
-    ) -> None:
+    def __init__(self, robot: AsyncRobot, loop: LoopThread, feed: Feed, send: MessageSender, uploads: Uploads) -> None:
         self._robot = robot
         self._loop = loop
         self._feed = feed
