@@ -43,6 +43,8 @@ from trirail.wire.vocabulary import MODES, Mode
 
 POSE = (0.02, -0.01, 0.1)
 GEOMETRY = geometry(CONFIG.geometry)
+ABSENT = {errno.ENOENT, errno.ENOTDIR, errno.EBADF, errno.ELOOP}
+"""Errors that say, as pathlib sees it, that there is no file."""
 PARKED = msgspec.structs.replace(CONFIG, poses={"park": (0.0, 0.05, 0.0)})
 
 
@@ -91,6 +93,11 @@ class Asked:
         assert self.woken.wait(20.0)
         self.woken.clear()
         self.poses.settle()
+
+    def look(self) -> None:
+        """Let the file be checked, and take what was found."""
+        self.poses.poll()
+        self.write()
 
     def known(self) -> dict[str, tuple[float, float, float]]:
         return {pose.name: (pose.x, pose.y, pose.phi) for pose in self.poses.table().poses}
@@ -177,7 +184,7 @@ def test_poses_whose_file_goes_are_neither_silently_kept_nor_lost(acts: list[str
                 asked.now += CHECK_PERIOD_S
                 before = [said for said in asked.told if said.kind == "service"]
                 was_told = bool(asked.poses.warnings())
-                asked.poses.poll()
+                asked.look()
                 told = [said for said in asked.told if said.kind == "service"][len(before) :]
                 assert len(told) == (gone and not was_told)
                 assert bool(asked.poses.warnings()) is gone
@@ -186,6 +193,44 @@ def test_poses_whose_file_goes_are_neither_silently_kept_nor_lost(acts: list[str
             if not gone and file.exists():
                 assert set(json.loads(file.read_text())) == known
         asked.poses.close()
+
+
+@given(number=st.sampled_from(sorted(errno.errorcode.keys() - ABSENT)))
+def test_a_folder_that_cannot_be_read_ends_neither_the_gateway_nor_the_answers(number: int) -> None:
+    """A network home answers EIO or ESTALE while it is away, and a changed mode EACCES."""
+
+    def fails(path: Path, **_: object) -> os.stat_result:
+        raise OSError(number, os.strerror(number), str(path))
+
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STATE_DIRECTORY", folder)
+        asked = Asked(CONFIG)
+        asked.teach("a")
+        with pytest.MonkeyPatch.context() as away:
+            away.setattr(Path, "stat", fails)
+            asked.look()
+            asked.ask("forget", "a")
+            asked.write()
+        assert asked.poses.warnings() == (), "nobody knows that the file is gone"
+        assert len(asked.replies) + len(asked.refusals) == 2, "each request is answered"
+        asked.poses.close()
+
+
+def test_a_folder_that_does_not_answer_holds_nobody_up(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, answers, stat = make(CONFIG), threading.Event(), Path.stat
+
+    def slowly(path: Path, **how: bool) -> os.stat_result:
+        assert answers.wait(20.0)
+        return stat(path, **how)
+
+    monkeypatch.setattr(Path, "stat", slowly)
+    for asked.now in (10.0, 20.0, 30.0):
+        asked.poses.poll()
+        asked.poses.settle()
+    answers.set()
+    asked.write()
+    asked.now += CHECK_PERIOD_S
+    asked.look()
 
 
 @pytest.mark.parametrize("step", ["mkstemp", "fsync", "replace"])
@@ -200,7 +245,7 @@ def test_a_first_pose_that_cannot_be_written_is_refused_and_nothing_counts_as_lo
     assert [refusal.code for refusal in asked.refusals] == [RefusalCode.FAILED]
     for each in (asked, make(CONFIG)):
         each.now += CHECK_PERIOD_S
-        each.poses.poll()
+        each.look()
         assert (each.told, each.poses.warnings()) == ([], ())
     asked.teach("pick")
     assert make(CONFIG).known() == {"pick": POSE}
@@ -379,7 +424,7 @@ def test_a_gateway_that_is_started_again_goes_on_without_what_cannot_be_read_and
         (warning,) = later.poses.warnings()
         assert "; no taught poses are available now; the file is kept as " in warning
         for later.now in (0.0, 100.0):
-            later.poses.poll()
+            later.look()
         assert uncoded(later.told) == [Notice("service", "warning", warning)]
         assert [told.params for told in later.told] == [{"file": str(folder / "poses.json")}]
     kept = [path for path in folder.iterdir() if path.name.startswith("poses.json.broken")]

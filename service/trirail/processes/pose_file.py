@@ -82,13 +82,19 @@ class PoseFile:
             self.path.rename(aside)
         return aside
 
-    @property
-    def gone(self) -> bool:
-        """True if the file does not exist although its folder exists, because the file was deleted or moved.
+    def is_gone(self) -> bool:
+        """Return True if the file does not exist although its folder exists, because the file was deleted or moved.
 
-        Removing the last pose does not delete the file, and a first change that fails does not leave the folder.
+        Removing the last pose does not delete the file, and a first change that fails does not leave the folder. A file
+        that cannot be looked up, for example because a network folder does not respond, is not gone.
         """
-        return self.path.parent.is_dir() and not self.path.exists()
+        try:
+            self.path.stat()
+        except FileNotFoundError:
+            return os.path.isdir(self.path.parent)
+        except OSError:
+            return False
+        return False
 
     def change(self, name: str, pose: TaughtPose | None, known: Taught | None = None) -> None:
         """Save a pose under a name, or remove a pose. Return when the change has been written to the disk.
@@ -103,8 +109,9 @@ class PoseFile:
             Poses to write in addition if the file has been deleted.
 
         """
-        is_first = not self.path.parent.is_dir()
+        is_first = False
         try:
+            is_first = not self.path.parent.is_dir()
             files.make_folder(self.path.parent)
             with _alone_in(self.path.parent):
                 there = self.read() if self.path.exists() else known or {}
@@ -115,7 +122,7 @@ class PoseFile:
                 files.replace(self.path, msgspec.json.format(content) + b"\n")
         except OSError as error:
             if is_first:
-                # An empty folder would mean that poses are lost, see `gone`. It stays if it contains anything.
+                # An empty folder would mean that poses are lost, see `is_gone`. It stays if it contains anything.
                 with suppress(OSError):
                     self.path.parent.rmdir()
             raise ServiceError(f"{error.filename or self.path}: {error.strerror}") from error

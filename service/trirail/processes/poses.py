@@ -1,17 +1,19 @@
 """Named poses in the gateway: poses in the [poses] section of the configuration, and taught poses in a file.
 
-A separate thread writes taught poses, because writing to the disk may take longer than the time-out of the gateway's
-heartbeat. A taught pose is confirmed, announced and usable in goals when it has been written to the disk.
+A separate thread writes taught poses and checks their file, because the disk may take longer than the time-out of the
+gateway's heartbeat. A taught pose is confirmed, announced and usable in goals when it has been written to the disk.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import msgspec
@@ -96,7 +98,8 @@ class Poses:
         self._to_measure: deque[_Change] = deque()
         self._lacking_announced = False
         self._under_way = 0
-        self._written: queue.SimpleQueue[tuple[_Change, ServiceError | None]] = queue.SimpleQueue()
+        self._finished: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        """Functions that handle the results of the writer's thread, in the order of the results."""
         self._writer = ThreadPoolExecutor(1, "poses")
         self._clock = clock
         self._next_check = clock()
@@ -120,15 +123,20 @@ class Poses:
         return pose.geometry not in ("", self._geometry_id)
 
     def poll(self) -> None:
-        """Check periodically that the file of taught poses exists, and announce its loss."""
+        """Begin to check periodically that the file of taught poses exists; `settle` announces its loss."""
         if self._clock() < self._next_check:
             return
-        self._next_check = self._clock() + CHECK_PERIOD_S
+        self._next_check = math.inf  # until this check has ended, for which a disk may take long
         if self._lacking and not self._lacking_announced:
             lacking = coded(self._lacking, EventCode.POSES_UNREADABLE, file=str(self._file.path))
             self._announce(Notice("service", "warning", lacking.text, **lacking.fields))
             self._lacking_announced = True
-        before, self._gone = self._gone, self._lost_warning() if self._file.gone and not self._lacking else ""
+        self._writer.submit(self._check_file)
+
+    def _on_checked(self, *, is_gone: bool) -> None:
+        """Announce the loss of the file of taught poses, once."""
+        self._next_check = self._clock() + CHECK_PERIOD_S
+        before, self._gone = self._gone, self._lost_warning() if is_gone and not self._lacking else ""
         if self._gone and not before:
             gone = coded(self._gone, EventCode.POSES_LOST, file=str(self._file.path))
             self._announce(Notice("service", "warning", gone.text, **gone.fields))
@@ -206,26 +214,26 @@ class Poses:
                 self._refuse(wanted.incoming, refusal)
 
     def settle(self) -> None:
-        """Answer and announce the changes that have been written."""
-        while True:
-            try:
-                change, failure = self._written.get_nowait()
-            except queue.Empty:
-                return
-            self._under_way -= 1
-            pose = change.pose or self._taught.get(change.name)
-            if failure is not None or pose is None:  # None if two clients have removed the pose at the same time
-                why = f"pose {change.name} is unchanged: {failure or 'another client has removed it'}"
-                self._refuse(change.incoming, RefusedError(RefusalCode.FAILED, why))
-                continue
-            if change.pose is not None:
-                self._taught[change.name] = pose
-            else:
-                del self._taught[change.name]
-            self._lacking = ""  # the file now has every taught pose
-            self._reply(change.incoming, self._named(change.name, pose))
-            text = _words(change)
-            self._announce(Notice("pose", "info", text.text, user=change.user, **text.fields))
+        """Answer and announce the changes that have been written, and announce the loss of the file."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._finished.get_nowait()()
+
+    def _on_written(self, change: _Change, failure: ServiceError | None) -> None:
+        self._under_way -= 1
+        pose = change.pose or self._taught.get(change.name)
+        if failure is not None or pose is None:  # None if two clients have removed the pose at the same time
+            why = f"pose {change.name} is unchanged: {failure or 'another client has removed it'}"
+            self._refuse(change.incoming, RefusedError(RefusalCode.FAILED, why))
+            return
+        if change.pose is not None:
+            self._taught[change.name] = pose
+        else:
+            del self._taught[change.name]
+        self._lacking = ""  # the file now has every taught pose
+        self._reply(change.incoming, self._named(change.name, pose))
+        text = _words(change)
+        self._announce(Notice("pose", "info", text.text, user=change.user, **text.fields))
 
     def close(self) -> None:
         """Finish and answer all pending changes. Requests that wait for a record are answered with an error."""
@@ -274,7 +282,12 @@ class Poses:
             self._file.change(change.name, change.pose, dict(self._taught))
         except ServiceError as error:
             failure = error
-        self._written.put((change, failure))
+        self._finished.put(partial(self._on_written, change, failure))
+        self._wake()
+
+    def _check_file(self) -> None:
+        """Check that the file exists. This method runs in the writer's thread."""
+        self._finished.put(partial(self._on_checked, is_gone=self._file.is_gone()))
         self._wake()
 
 
