@@ -53,11 +53,6 @@ def test_lines_of_json_are_the_events() -> None:
     assert json.loads(words) == said
 
 
-def test_what_is_told_again_is_written_once() -> None:
-    told = [msgspec.structs.replace(FAULT, seq=seq) for seq in (1, 2, 3, 1, 2, 3, 4)]
-    assert len(written("text", *told)) == 5
-
-
 @given(st.text(max_size=50))
 def test_whatever_is_said_stays_one_line(words: str) -> None:
     event = msgspec.structs.replace(FAULT, message=words)

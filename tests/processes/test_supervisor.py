@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import itertools
 import os
+import random
 import tempfile
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.kinematics.compiled import FUNCTIONS
 from trirail.processes import forked_processes, supervisor
+from trirail.processes.monitoring import Health
+from trirail.wire.messages import Event
 from waiting import WITHIN
 
 pytestmark = pytest.mark.long
@@ -24,6 +27,7 @@ import os, signal, sys, time
 from pathlib import Path
 
 from trirail.processes import compiling, fork_server
+from trirail.wire.messages import Event
 
 folder = Path({folder!r})
 compiling.load = lambda: True
@@ -39,6 +43,9 @@ def never():
 def freeze():
     while not never():
         time.sleep(0.1)
+
+def goal(seq):
+    return Event(seq=seq, t=0.0, cycle=seq, time=0.0, kind="goal", level="info", message="", id="g", outcome="done")
 
 def work(child):
     name, heartbeats, ready = child.name, child.heartbeats, lambda: child.report_ready({{}})
@@ -91,6 +98,8 @@ class Running:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.told: list[str] = []
+        self.events: list[Event] = []
+        self.health: Health
 
     def ends(self, code: int, config: Config = CONFIG, /, **children: str) -> None:
         """Run it until it ends with an exit code.
@@ -108,7 +117,9 @@ class Running:
             tell("up")
             (self.folder / "up.begun").touch()
 
-        assert supervisor.Supervisor(config, None, lambda words, _: tell(words)).run(up) == code
+        supervised = supervisor.Supervisor(config, None, lambda words, _: tell(words), self.events.append)
+        assert supervised.run(up) == code
+        self.health = supervised._health
 
 
 @pytest.fixture(autouse=True)
@@ -138,6 +149,23 @@ def test_a_hung_gateway_is_killed_and_started_again(run: Running) -> None:
         "position; "
         "restarting it",
     ]
+
+
+@pytest.mark.generated(0, 1, 2)
+def test_a_gateway_that_is_started_again_repeats_events_that_are_told_and_counted_once(run: Running, seed: int) -> None:
+    """It is sent the newest of the events that were before it, and later ones."""
+    chance = random.Random(seed)
+    before, after = chance.randrange(1, 60), chance.randrange(20)
+    first = chance.randrange(1, before + 1)
+    tell = "ready()\nfor seq in range({}, {}): child.log(goal(seq))\n"
+    run.ends(
+        1,
+        loop_1="ready(); beat_until(lambda: begun('all')); heartbeats.heart('loop').rest()",
+        gateway_1=tell.format(1, before + 1) + DYING.removeprefix("ready(); "),
+        gateway_2=tell.format(first, before + after + 1) + "(folder / 'all.begun').touch()",
+    )
+    assert [event.seq for event in run.events] == [*range(1, before + after + 1)]
+    assert run.health.events.goals == {"done": before + after}
 
 
 def test_a_gateway_that_hangs_in_its_start_is_killed(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,7 +67,6 @@ class Log:
         self._write = write or unbuffered(sys.stdout)
         self._clock = clock
         self._to_journal = "JOURNAL_STREAM" in environment
-        self._newest = 0
         self._room = float(BURST)
         self._looked = clock()
         self._left_out = 0
@@ -98,10 +97,7 @@ class Log:
                 self._waiting.put(text)
 
     def event(self, event: Event) -> None:
-        """Write an event, but only once, because a restarted gateway sends past events again."""
-        if event.seq <= self._newest:
-            return
-        self._newest = event.seq
+        """Write an event, unless too many events arrive."""
         if not self._has_room() and event.level != "error":
             self._left_out += 1
             return

@@ -335,8 +335,6 @@ class Gateway:
             self._requests.backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
         self._log(event)
-        if self._meter is not None:
-            self._meter.event(event)
 
     def _handle_last_packets(self, ready: Callable[[], None]) -> None:
         """Handle the last messages of the loop, which may include its farewell."""

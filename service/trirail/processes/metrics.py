@@ -30,7 +30,7 @@ from trirail_drivers.interface import NAMES
 
 from trirail.config import Config, metrics_url
 from trirail.errors import ServiceError
-from trirail.processes.monitoring import Health, Histogram, Running, ServiceMeasurements
+from trirail.processes.monitoring import EventCounts, Health, Histogram, Running, ServiceMeasurements
 from trirail.processes.zenoh_links import ResourceUse
 from trirail.telemetry.provenance import software
 from trirail.wire import tls
@@ -60,7 +60,7 @@ class ServiceMetrics(Collector):
         yield from self._processes()
         if (service := self._health.service) is not None:
             yield from _loop(service)
-            yield from _goals(service)
+            yield from _goals(self._health.events)
             yield from _can(service)
             yield from _digital(service)
             yield from _use(service.use)
@@ -98,15 +98,14 @@ def _loop(service: ServiceMeasurements) -> Iterator[Metric]:
     yield _histogram("loop_cycle_seconds", "Duration of a cycle's work.", service.cycle)
 
 
-def _goals(service: ServiceMeasurements) -> Iterator[Metric]:
-    yield _counter("goals", "Goals that have ended, by outcome.", ["outcome"], service.goals)
+def _goals(events: EventCounts) -> Iterator[Metric]:
+    yield _counter("goals", "Goals that have ended, by outcome.", ["outcome"], events.goals.copy())
     yield _histogram(
-        "goal_settle_seconds", "Time from the end of a goal's path until the robot was in position.", service.settle
+        "goal_settle_seconds", "Time from the end of a goal's path until the robot was in position.", events.settle
     )
     faults = _counter("faults", "Faults, by cause, drive and the drive's own code.", ["cause", "drive", "code"])
-    for count in service.faults:
-        code = f"0x{count.fault.code:04X}" if count.fault.code else ""
-        faults.add_metric([count.fault.cause, count.fault.drive, code], count.times)
+    for fault, times in events.faults.copy().items():
+        faults.add_metric([fault.cause, fault.drive, f"0x{fault.code:04X}" if fault.code else ""], times)
     yield faults
 
 

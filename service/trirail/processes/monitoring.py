@@ -1,8 +1,8 @@
 """Measurements of gateway and recorder, and health of all processes, which the supervisor provides for monitoring.
 
 Measurements are totals since the start of the loop, and are sent to the supervisor once per second. The supervisor also
-checks all processes periodically. Monitoring requests are answered in separate threads, which can therefore also report
-that the supervisor is blocked.
+counts goals and faults in the events for its log, and checks all processes periodically. Monitoring requests are
+answered in separate threads, which can therefore also report that the supervisor is blocked.
 """
 
 from __future__ import annotations
@@ -58,11 +58,27 @@ class Histogram(Struct):
         self.total += float(values.sum())
 
 
-class FaultCount(Struct, frozen=True):
-    """Number of faults of one kind."""
+class EventCounts:
+    """Numbers of goals and faults in the events of the service, which the supervisor receives once each."""
 
-    fault: FaultDetail
-    times: int
+    def __init__(self) -> None:
+        self.goals: dict[str, int] = {}
+        """Number of goals that have ended, by outcome."""
+        self.faults: dict[FaultDetail, int] = {}
+        self.settle = Histogram.empty(SETTLE_BOUNDS)
+        """Time from the end of the path until the robot was in position, for each goal that is done [s]."""
+
+    def add(self, event: Event) -> None:
+        """Count an event."""
+        if event.outcome is not None:
+            self.goals[event.outcome] = self.goals.get(event.outcome, 0) + 1
+            if event.settle is not None:
+                self.settle.add(np.array([event.settle]))
+        if event.kind == "fault":
+            fault = event.fault or OTHER
+            if fault not in self.faults and len(self.faults) >= MAX_FAULT_KINDS:
+                fault = OTHER
+            self.faults[fault] = self.faults.get(fault, 0) + 1
 
 
 class ServiceMeasurements(Struct, frozen=True):
@@ -81,11 +97,6 @@ class ServiceMeasurements(Struct, frozen=True):
     """Delay of each cycle after its deadline [s]."""
     cycle: Histogram
     """Duration of each cycle's work [s]."""
-    settle: Histogram
-    """Time from the end of the path until the robot was in position, for each goal that is done [s]."""
-    goals: dict[str, int]
-    """Number of goals that have ended, by outcome."""
-    faults: tuple[FaultCount, ...]
     use: ResourceUse
     """Use of resources that are limited, such as file descriptors."""
     warnings: tuple[str, ...]
@@ -108,36 +119,18 @@ class RecorderMeasurements(Struct, frozen=True):
 
 
 class Meter:
-    """Counter for the gateway's measurements.
-
-    After a restart of the gateway, the histograms of cycles begin at 0. Past events are sent again, and are counted.
-    """
+    """Counter for the gateway's measurements. After a restart of the gateway, the histograms begin at 0."""
 
     def __init__(self, send: Callable[[Struct], None], clock: Callable[[], float] = time.monotonic) -> None:
         self._send = send
         self._clock = clock
         self._due = clock()
         self._lateness, self._cycle = Histogram.empty(CYCLE_BOUNDS), Histogram.empty(CYCLE_BOUNDS)
-        self._settle = Histogram.empty(SETTLE_BOUNDS)
-        self._goals: dict[str, int] = {}
-        self._faults: dict[FaultDetail, int] = {}
 
     def records(self, rows: NDArray[np.void]) -> None:
         """Add a batch of records to the measurements."""
         self._lateness.add(rows["lateness_ns"] * 1e-9)
         self._cycle.add(rows["parts_ns"].sum(axis=1) * 1e-9)
-
-    def event(self, event: Event) -> None:
-        """Add an event to the measurements."""
-        if event.outcome is not None:
-            self._goals[event.outcome] = self._goals.get(event.outcome, 0) + 1
-            if event.settle is not None:
-                self._settle.add(np.array([event.settle]))
-        if event.kind == "fault":
-            fault = event.fault or OTHER
-            if fault not in self._faults and len(self._faults) >= MAX_FAULT_KINDS:
-                fault = OTHER
-            self._faults[fault] = self._faults.get(fault, 0) + 1
 
     def publish(self, newest: Callable[[], State], use: ResourceUse, warnings: tuple[str, ...]) -> None:
         """Send all measurements if MEASUREMENT_PERIOD_S has passed since they were last sent."""
@@ -157,9 +150,6 @@ class Meter:
                 traffic=state.sliders.traffic,
                 lateness=self._lateness,
                 cycle=self._cycle,
-                settle=self._settle,
-                goals=self._goals,
-                faults=tuple(FaultCount(fault, times) for fault, times in self._faults.items()),
                 use=use,
                 warnings=warnings,
                 outputs=state.outputs,
@@ -212,6 +202,7 @@ class Health:
         self._stored_at: dict[str, float] = {}
         self.service: ServiceMeasurements | None = None
         self.recorder: RecorderMeasurements | None = None
+        self.events = EventCounts()
 
     def poll(self, processes: Mapping[str, Running]) -> None:
         """Check all processes. The supervisor calls this method at a fixed interval."""

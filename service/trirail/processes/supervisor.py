@@ -92,7 +92,7 @@ class Supervisor:
     report
         Function called with each message about the processes and with the level of the message.
     on_event
-        Function called with each event of the service.
+        Function called once with each event of the service.
 
     """
 
@@ -127,6 +127,7 @@ class Supervisor:
         }
         self._health = Health(self._heartbeats, config.period, CHECK_PERIOD_S)
         self._watchdog = Watchdog([self._heartbeats.heart(name) for name in WATCHED_BY_SYSTEMD])
+        self._newest_event = 0
         self._next_turn = 0.0
         self._progress_at = 0.0
         self._ending = False
@@ -330,7 +331,11 @@ class Supervisor:
 
     def _pass_on(self, child: ChildProcess) -> None:
         while child.events:
-            self._on_event(child.events.pop(0))
+            event = child.events.pop(0)
+            if event.seq > self._newest_event:  # a restarted gateway sends past events again
+                self._newest_event = event.seq
+                self._health.events.add(event)
+                self._on_event(event)
         while child.measurements:
             self._health.store(child.name, child.measurements.pop(0))
 
