@@ -5,12 +5,13 @@ from __future__ import annotations
 import fcntl
 import os
 import random
+import select
 from collections.abc import Iterator
 
 import msgspec
 import pytest
 from trirail.processes import child_process
-from trirail.processes.child_process import COMPILING, MEASURED, Child
+from trirail.processes.child_process import COMPILING, LOG_WITHIN, MEASURED, Child
 
 
 class Said(msgspec.Struct):
@@ -83,3 +84,31 @@ def test_a_message_that_must_arrive_follows_the_rest_of_another(pipe: tuple[int,
         {MEASURED: msgspec.to_builtins(said)},
         {COMPILING: "a function"},
     ]
+
+
+@pytest.mark.generated(0, 1, 2, 3)
+def test_a_supervisor_that_reads_nothing_is_waited_for_once(
+    pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Each wait would delay the next stop in the gateway."""
+    waited: list[float] = []
+    at_once = select.select
+
+    def count(read: list[int], write: list[int], other: list[int], seconds: float) -> tuple[list[int], ...]:
+        ready = at_once(read, write, other, 0.0)
+        waited.append(0.0 if ready[1] else seconds)
+        return ready
+
+    monkeypatch.setattr(select, "select", count)
+    chance, (read, write) = random.Random(seed), pipe
+    fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, chance.choice((4096, 8192, 65_536)))
+    child = Child("gateway", None, None, None, [], write)  # type: ignore[arg-type]
+    for _ in range(3):
+        waited.clear()
+        for number in range(200):
+            child.log(Said(number, "x" * chance.choice((10, 300, 3000, 6000))))  # type: ignore[arg-type]
+        assert sum(waited) == pytest.approx(LOG_WITHIN)
+        while heard(read):
+            pass
+        child.log(Said(200, ""))  # type: ignore[arg-type]
+        assert b'"number":200' in heard(read), "what follows a pause is not lost"

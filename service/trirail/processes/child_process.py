@@ -62,6 +62,8 @@ class Child:
         self._pipe = voice
         self._unsent = b""
         """Rest of a message that has been sent in part."""
+        self._is_full = False
+        """True if the pipe did not take all of the newest message. The next message does not wait for the pipe."""
 
     def report_ready(self, content: object) -> None:
         """Report to the supervisor that the process has started.
@@ -77,7 +79,10 @@ class Child:
         self._send({COMPILING: function})
 
     def log(self, event: Event) -> None:
-        """Send an event to the supervisor for the log; drop the event if the pipe is full for LOG_WITHIN."""
+        """Send an event to the supervisor for the log; drop the event if the pipe is full for LOG_WITHIN.
+
+        Later events are dropped without waiting until the pipe has space again, because the gateway must not be slow.
+        """
         self._send({HAPPENED: event}, LOG_WITHIN)
 
     def report_measurements(self, content: msgspec.Struct) -> None:
@@ -89,11 +94,15 @@ class Child:
 
         The message is dropped if the pipe is full for `seconds`; None means that it is never dropped.
         """
+        if seconds is not None and self._is_full:
+            seconds = 0.0
         self._unsent = self._send_part(self._unsent, seconds)
+        self._is_full = bool(self._unsent)
         if not self._unsent:
             line = msgspec.json.encode(content) + b"\n"
             rest = self._send_part(line, seconds)
             self._unsent = rest if len(rest) < len(line) else b""
+            self._is_full = bool(rest)
 
     def _send_part(self, line: bytes, seconds: float | None) -> bytes:
         """Send as much of a line as the pipe takes, each part within `seconds`, and return the rest."""
