@@ -346,6 +346,7 @@ def test_a_file_that_is_no_socket_is_kept_and_told_with_the_remedy(tmp_path: Pat
             left.bind(str(tmp_path / name))
     guard.stop_port(lambda *_: None).close()
     assert not any("no stop port" in warning for warning in guard.warnings())
+    assert not (tmp_path / "z.stop").exists(), "the file is not left behind"
     with guard.open():
         pass
 

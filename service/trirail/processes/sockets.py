@@ -138,9 +138,17 @@ def listen(address: StopAddress) -> list[socket.socket]:
         except OSError as error:
             if error.errno not in _ABSENT or (number == len(places) and not listening):
                 for opened in listening:
-                    opened.close()
+                    close(opened)
                 raise
     return listening
+
+
+def close(listening: socket.socket) -> None:
+    """Stop listening, and remove the file of a Unix socket."""
+    if listening.family == socket.AF_UNIX:
+        with contextlib.suppress(OSError):  # the file or its folder has been deleted
+            os.unlink(listening.getsockname())
+    listening.close()
 
 
 _ABSENT = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)

@@ -21,7 +21,7 @@ from enum import Enum, auto
 from typing import Final, TypeVar
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.sockets import Reserve, descriptor_limit, listen, source
+from trirail.processes.sockets import Reserve, close, descriptor_limit, listen, source
 from trirail.wire import tls
 from trirail.wire.decoding import INVALID, decoded
 from trirail.wire.messages import CommandReply, ErrorReply
@@ -115,7 +115,7 @@ class StopPort:
         await self._closing.wait()
         for listening in self._listening:
             self._loop.remove_reader(listening)
-            listening.close()
+            close(listening)
         tasks = [caller.task for caller in self._callers if caller.task is not None]
         for caller in list(self._callers):
             self._drop(caller)
