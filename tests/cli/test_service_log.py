@@ -7,6 +7,9 @@ import io
 import json
 import os
 import re
+import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +19,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.cli import service_log
-from trirail.cli.service_log import MAX_WAITING, Log, unbuffered
+from trirail.cli.service_log import MAX_WAITING, Form, Log, is_journal, unbuffered
+from trirail.config import SIM
 from trirail.wire.messages import Event
 from waiting import WITHIN, wait_until
 
@@ -25,9 +29,9 @@ FAULT = Event(
 )
 
 
-def written(form: str, *events: Event, **environment: str) -> list[str]:
+def written(form: Form, *events: Event, to_journal: bool = False) -> list[str]:
     out = io.StringIO()
-    log = Log(form, out.write, clock=lambda: 1_700_000_000.0, environment=environment)  # type: ignore[arg-type]
+    log = Log(form, out.write, clock=lambda: 1_700_000_000.0, to_journal=to_journal)
     for event in events:
         log.event(event)
     log.log("the planner has died", "warning")
@@ -41,9 +45,28 @@ def test_a_line_has_time_level_and_words() -> None:
 
 
 def test_journald_is_told_the_level() -> None:
-    fault, words = written("text", FAULT, JOURNAL_STREAM="8:1")
+    fault, words = written("text", FAULT, to_journal=True)
     assert fault.startswith("<3>2023-11-1")
     assert words.startswith("<4>2023-11-1")
+
+
+def test_journald_reads_only_the_stream_that_it_has_given(tmp_path: Path) -> None:
+    """Whatever runs in a terminal of a desktop session inherits the variable of the session."""
+    with socket.socket(socket.AF_UNIX) as journal, (tmp_path / "log").open("w") as file:
+        status = os.fstat(journal.fileno())
+        session = {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
+        assert is_journal(journal.fileno(), session)
+        assert not is_journal(file.fileno(), session)
+        assert not is_journal(journal.fileno(), {})
+
+
+def test_a_service_in_a_terminal_writes_no_priorities(tmp_path: Path) -> None:
+    config = SIM.read_text().replace('"tcp/127.0.0.1:7447"', '"tls/127.0.0.1:7447"') + "\n[zenoh.tls]\n"
+    (tmp_path / "no-keys.toml").write_text(config)
+    command = [sys.executable, "-m", "trirail", "run", str(tmp_path / "no-keys.toml")]
+    ran = subprocess.run(command, env=os.environ | {"JOURNAL_STREAM": "8:1"}, capture_output=True, check=False)
+    assert b"  info     starting robot" in ran.stdout
+    assert b"<6>" not in ran.stdout
 
 
 def test_lines_of_json_are_the_events() -> None:
@@ -62,7 +85,7 @@ def test_whatever_is_said_stays_one_line(words: str) -> None:
 
 def test_a_flood_of_events_is_cut_short_and_says_so_but_errors_are_written() -> None:
     out, now = io.StringIO(), 1_700_000_000.0
-    log = Log("text", out.write, clock=lambda: now, environment={})
+    log = Log("text", out.write, clock=lambda: now)
     refused = msgspec.structs.replace(FAULT, kind="refused", level="warning", message="refused: too many")
     for seq in range(1, 60_001):  # a thousand a second
         now += 0.001
@@ -77,7 +100,7 @@ def test_a_flood_of_events_is_cut_short_and_says_so_but_errors_are_written() -> 
 
 def test_what_comes_slowly_is_written_whole() -> None:
     out, now = io.StringIO(), 1_700_000_000.0
-    log = Log("text", out.write, clock=lambda: now, environment={})
+    log = Log("text", out.write, clock=lambda: now)
     for seq in range(1, 501):
         now += 1.0
         log.event(msgspec.structs.replace(FAULT, seq=seq, level="info"))

@@ -67,14 +67,14 @@ def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Litera
 
     os.environ.update(ONE_THREAD)  # before anything imports numpy
 
-    from trirail.cli.service_log import Log
+    from trirail.cli.service_log import Log, is_journal
     from trirail.config import SIM, load
     from trirail.processes.supervisor import Supervisor
     from trirail.wire.starting import Starting
 
     settings = load(config or SIM)
     form = log or settings.telemetry.log
-    lines = Log(form)
+    lines = Log(form, to_journal=is_journal(1))
     can = settings.can
     drives = f"drives on {can.interface} {can.channel}".strip() if can.interface != "simulated" else "simulated drives"
     lines.log(f"starting robot {settings.robot.name}: {drives}, {settings.loop.rate_hz} Hz")

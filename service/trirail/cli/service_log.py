@@ -44,6 +44,16 @@ def unbuffered(stream: TextIO) -> Callable[[str], None]:
     return write
 
 
+def is_journal(descriptor: int, environment: Mapping[str, str] = os.environ) -> bool:
+    """Return True if journald reads what is written to a descriptor.
+
+    JOURNAL_STREAM names the file that journald reads. Programs that are started in a terminal of a desktop session
+    inherit the variable, but write to another file: systemd.exec(5).
+    """
+    status = os.fstat(descriptor)
+    return environment.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
 class Log:
     """Writer of lines with time and level.
 
@@ -53,6 +63,8 @@ class Log:
     ----------
     write
         Function that writes a text and may block; None for standard output.
+    to_journal
+        Whether journald reads the lines, each of which then begins with its priority.
 
     """
 
@@ -61,12 +73,13 @@ class Log:
         form: Form,
         write: Callable[[str], object] | None = None,
         clock: Callable[[], float] = time.time,
-        environment: Mapping[str, str] = os.environ,
+        *,
+        to_journal: bool = False,
     ) -> None:
         self._json = form == "json"
         self._write = write or unbuffered(sys.stdout)
         self._clock = clock
-        self._to_journal = "JOURNAL_STREAM" in environment
+        self._to_journal = to_journal
         self._room = float(BURST)
         self._looked = clock()
         self._left_out = 0
