@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -13,6 +14,9 @@ def main() -> None:
     Loading the command line takes a third of a second; during that time, Ctrl-C ends the process at signal level.
     """
     _open_standard_streams()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a command that has acted must not fail as it reports that
+            stream.reconfigure(errors="backslashreplace")
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # nohup ignores it
     if handled:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shlex
@@ -24,6 +25,7 @@ from cyclopts import App
 from generated import thinned
 from hypothesis import example, given
 from hypothesis import strategies as st
+from trirail import __main__
 from trirail.cli import app, help_pages, live, notation, recording_commands, terminal, view
 from trirail.client import client, connection
 from trirail.client.goal import Result
@@ -33,6 +35,7 @@ from trirail.wire.goal_kind import GoalKind, field_description
 from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.messages import GoalReply
 from trirail.wire.state import NamedPose
+from trirail.wire.text import json_printable
 from waiting import WITHIN
 
 Run = Callable[..., tuple[int, str, str]]
@@ -679,3 +682,40 @@ def test_a_jog_ends_after_its_time_even_if_no_state_comes(run: Run, monkeypatch:
     monkeypatch.setattr(live, "table", lambda *_: "")
     monkeypatch.setattr(client, "Robot", lambda *_, **__: robot)
     assert run("jog", "0.01", "0", "0", "--seconds", "0.05") == (0, "goal g-1 done\n", "")
+
+
+SPEAKING = [
+    "ik 0.01 0 0.05",
+    "workspace",
+    "doctor --quick",
+    "ik 0.01 0 0.05 --json",
+    "doctor --quick --json",
+    "ik 9 0 0",
+]
+
+
+@pytest.mark.parametrize("words", SPEAKING)
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "koi8-r", "shift_jis", "utf-8"])
+def test_an_output_that_lacks_characters_ends_no_command(
+    words: str, encoding: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A command may have moved the robot when it says so. Programs read JSON as UTF-8 whatever the terminal shows."""
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding) for _ in range(2))
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", err)
+    monkeypatch.setattr(sys, "argv", ["trirail", *words.split()])
+    with pytest.raises(SystemExit) as ended:
+        __main__.main()
+    for stream in (out, err):
+        stream.flush()
+    written, errors = (stream.buffer.getvalue() for stream in (out, err))
+    assert ended.value.code == ("ik 9" in words), errors
+    assert b"Traceback" not in errors
+    if "--json" in words:
+        json.loads(written.decode())
+
+
+@given(st.text(), st.sampled_from(["ascii", "latin-1", "utf-8", "cp1252"]))
+def test_json_is_json_in_whatever_encoding(words: str, encoding: str) -> None:
+    line = json_printable(json.dumps(words, ensure_ascii=False), encoding)
+    assert json.loads(line.encode(encoding).decode()) == words

@@ -133,7 +133,7 @@ class Log:
 
     def _line(self, moment: float, level: Level, words: str, content: object) -> str:
         if self._json:
-            return json_printable(msgspec.json.encode(content).decode()) + "\n"
+            return json_printable(msgspec.json.encode(content).decode(), sys.stdout.encoding) + "\n"
         line = f"{wall_clock(moment)}  {level:7}  {printable(words)}\n"
         return f"<{PRIORITIES[level]}>{line}" if self._to_journal else line
 

@@ -86,7 +86,7 @@ def json(content: object) -> None:
         line = msgspec.json.encode(content).decode()
     except UnicodeEncodeError:  # the name of a file need not be UTF-8
         line = dumps(msgspec.to_builtins(content))
-    sys.stdout.write(json_printable(line) + "\n")
+    sys.stdout.write(json_printable(line, sys.stdout.encoding) + "\n")
     sys.stdout.flush()
 
 

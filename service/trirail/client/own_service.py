@@ -54,7 +54,7 @@ def service(config: Path, recording: Path, report_start: Callable[[str], None] =
             raise  # the service works, and the refusal contains the reason
         except TrirailError:
             log.seek(0)
-            sys.stderr.write(log.read().decode())
+            sys.stderr.write(log.read().decode(errors="backslashreplace"))
             raise
         finally:
             if process is not None:

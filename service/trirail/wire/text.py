@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import re
@@ -61,9 +62,16 @@ def printable(text: str) -> str:
     return "".join(_escaped(character) if _is_hidden(character) else character for character in text)
 
 
-def json_printable(text: str) -> str:
-    """Return JSON with JSON escapes in place of control and invisible characters, for output on a terminal."""
-    return "".join(json.dumps(character)[1:-1] if _is_hidden(character) else character for character in text)
+def json_printable(text: str, encoding: str | None = None) -> str:
+    """Return JSON with JSON escapes in place of control and invisible characters, for output on a terminal.
+
+    If `encoding`, that of the output, is not UTF-8, other characters than ASCII are escaped too: RFC 8259, section 8.1.
+    """
+    is_utf8 = encoding is None or codecs.lookup(encoding).name == "utf-8"
+    return "".join(
+        json.dumps(character)[1:-1] if _is_hidden(character) or not (is_utf8 or character.isascii()) else character
+        for character in text
+    )
 
 
 def quoted(text: str) -> str:
