@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
 import re
 import select
 import socket
 import ssl
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterable, Iterator
@@ -24,9 +27,10 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from trirail.config import SIM, Config, Input, Output
 from trirail.errors import ServiceError
+from trirail.processes import metrics
 from trirail.processes.child_process import MEASURED
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
-from trirail.processes.metrics import MetricsServer, ServiceMetrics
+from trirail.processes.metrics import MAX_CONNECTIONS, MetricsServer, ServiceMetrics
 from trirail.processes.monitoring import (
     MAX_FAULT_KINDS,
     MAX_SILENCE_S,
@@ -44,6 +48,7 @@ from trirail.processes.publications import StateMaker
 from trirail.processes.zenoh_links import ResourceUse
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE
+from waiting import wait_until
 
 TURN = 0.1
 
@@ -288,6 +293,49 @@ def test_connections_that_say_nothing_keep_nobody_out(local: tuple[str, Health])
     assert get(f"{url}/metrics")[0] == 200
 
 
+def drip(address: tuple[str, int], content: bytes) -> None:
+    """Send a byte at a time on as many connections as are served, until the server has closed all of them."""
+    slow = [socket.create_connection(address) for _ in range(MAX_CONNECTIONS)]
+    for byte in itertools.islice(itertools.cycle(content), 200):
+        for connection in tuple(slow):
+            try:
+                connection.send(bytes((byte,)))
+                closed = bool(select.select([connection], [], [], 0.0)[0]) and not connection.recv(4096)
+            except ConnectionError:
+                closed = True
+            if closed:
+                slow.remove(connection)
+                connection.close()
+        if not slow:
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"{len(slow)} slow connections are still served")
+
+
+def is_served(url: str, context: ssl.SSLContext | None = None) -> bool:
+    try:
+        return get(f"{url}/metrics", context)[0] == 200
+    except OSError:
+        return False
+
+
+def client_hello() -> bytes:
+    out = ssl.MemoryBIO()
+    with contextlib.suppress(ssl.SSLWantReadError):
+        ssl.create_default_context().wrap_bio(ssl.MemoryBIO(), out, server_hostname="robot").do_handshake()
+    return out.read()
+
+
+@pytest.mark.parametrize("content", [b"GET /metrics" + 200 * b"x", b"GET / HTTP/1.1\r\n" + 30 * b"X: a\r\n"])
+def test_connections_that_say_little_at_a_time_keep_nobody_out(
+    local: tuple[str, Health], monkeypatch: pytest.MonkeyPatch, content: bytes
+) -> None:
+    monkeypatch.setattr(metrics, "CONNECTION_TIMEOUT_S", 0.5)
+    url, _ = local
+    drip(("127.0.0.1", int(url.rpartition(":")[2])), content)
+    wait_until(lambda: is_served(url))
+
+
 def test_a_port_that_is_taken_is_told_with_the_remedy() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         telemetry = msgspec.structs.replace(CONFIG.telemetry, metrics_port=taken.getsockname()[1])
@@ -329,3 +377,13 @@ def test_beyond_the_loopback_nobody_reads_them_without_a_good_certificate(
     with pytest.raises(OSError, match=r"(?i)alert|reset|closed|EOF|broken pipe"):
         get(f"{url}/metrics", shown(folder, name))
     assert get(f"{url}/metrics", shown(folder, "eva"))[0] == 200
+
+
+def test_handshakes_that_say_little_at_a_time_keep_nobody_out(
+    beyond: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metrics, "CONNECTION_TIMEOUT_S", 0.5)
+    url, folder = beyond
+    drip(("127.0.0.1", int(url.rpartition(":")[2])), client_hello())
+    monkeypatch.undo()
+    wait_until(lambda: is_served(url, shown(folder, "eva")))

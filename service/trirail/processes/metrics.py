@@ -14,6 +14,7 @@ import socket
 import ssl
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from socketserver import TCPServer
@@ -172,8 +173,8 @@ def _used(pid: int) -> tuple[float, float] | None:
     return int(pages) * PAGE, (int(fields[11]) + int(fields[12])) / TICKS
 
 
-REQUEST_TIMEOUT_S: Final = 2.0
-"""Maximum time for a client to send its request [s]."""
+CONNECTION_TIMEOUT_S: Final = 5.0
+"""Maximum duration of a connection, from the TLS handshake to the end of the answer [s]."""
 MAX_CONNECTIONS: Final = 16
 """Maximum number of connections served at the same time; further connections are closed."""
 
@@ -248,12 +249,15 @@ USER: Final = "trirail.user"
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = REQUEST_TIMEOUT_S
     slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
 
     def handle(self) -> None:
         if not self.slots.acquire(blocking=False):
             return  # the connection is closed
+        # A time-out of the socket would apply to each byte that a slow client sends.
+        end = threading.Timer(CONNECTION_TIMEOUT_S, self._disconnect)
+        end.daemon = True
+        end.start()
         try:
             if isinstance(self.connection, ssl.SSLSocket):
                 self.connection.do_handshake()
@@ -261,7 +265,14 @@ class _Handler(WSGIRequestHandler):
         except OSError:
             pass  # the peer has disconnected
         finally:
+            end.cancel()
+            end.join()  # afterwards, another connection may get the descriptor
             self.slots.release()
+
+    def _disconnect(self) -> None:
+        """End the connection, for which the handler may wait in another thread."""
+        with suppress(OSError):  # the peer has disconnected
+            socket.socket.shutdown(self.connection, socket.SHUT_RDWR)  # that of TLS would change the handler's state
 
     def get_environ(self) -> dict[str, Any]:
         shown = tls.peer(self.connection) if isinstance(self.connection, ssl.SSLSocket) else ""
