@@ -22,7 +22,7 @@ from trirail.telemetry.recorder import Recorder
 from trirail.wire.links import PACKETS_PER_TURN, LinkClosed, PacketLink
 from trirail.wire.messages import Event
 from trirail.wire.packets import EventReport, Kind, message
-from trirail.wire.records import DTYPE
+from trirail.wire.records import DTYPE, SIZE
 
 
 def config_in(folder: Path) -> Config:
@@ -40,12 +40,13 @@ def umask(request: pytest.FixtureRequest) -> Iterator[int]:
 def test_a_recording_and_its_folder_are_not_for_others(umask: int, tmp_path: Path) -> None:
     config = config_in(tmp_path / "new")
     ours, loops = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    loops.send(bytes((Kind.RECORDS,)) + bytes(SIZE))
     loops.close()  # the loop has gone, so it ends at once
     heart = Heartbeats.create().heart("recorder")
     with ours:
         assert recording.main(config, None, PacketLink(ours), heart, lambda _: None, lambda _: None) == 0
-    (file,) = (tmp_path / "new").glob("*.rrd")
-    assert stat.S_IMODE(file.stat().st_mode) == 0o640 & ~umask
+    modes = [stat.S_IMODE(file.stat().st_mode) for file in (tmp_path / "new").glob("*.rrd")]
+    assert modes == [0o640 & ~umask] * 2, "the recording, and the black box of the loop's death"
     assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o750 & ~umask
 
 

@@ -122,6 +122,7 @@ def test_events_are_lines_of_the_log(tmp_path: Path) -> None:
         Event("mode", "info", "enabled by ann", mode="holding", seq=1, t=0.5, cycle=500, time=WALL_NS * 1e-9)
     )
     recording.event(Event("fault", "error", "drive B: silent", seq=2, t=0.6, cycle=600, time=WALL_NS * 1e-9))
+    feed(recording, made.records(0.01))
     recording.close()
     assert lines(recording.path) == [("INFO", "enabled by ann"), ("ERROR", "drive B: silent")]
 
@@ -132,6 +133,33 @@ def test_files_are_named_by_the_wall_clock_and_never_overwritten(tmp_path: Path)
     second.close()
     assert first.path.name.startswith("demo-2026112")
     assert second.path.name == f"{first.path.stem}-2.rrd"
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    ran=st.booleans(),
+    named=st.booleans(),
+    sidecars=st.booleans(),
+    came=st.lists(st.sampled_from(["event", "frames"]), max_size=3),
+)
+def test_a_service_that_does_not_start_leaves_no_recording(
+    *, ran: bool, named: bool, sidecars: bool, came: list[str]
+) -> None:
+    """A service that is started again and again would push out the recordings of the robot by telemetry.keep_mb."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = folder / "mine.rrd" if named else None
+        recording = recorder(folder, configured(capture_can=True), path=path, sidecars=sidecars)
+        for what in came:
+            if what == "event":
+                recording.event(Event("service", "error", "no bus", seq=1, t=0.0, cycle=0, time=WALL_NS * 1e-9))
+            else:
+                recording.frames(CAPTURED.pack(1.0, Frame(0x201).packed))
+        if ran:
+            feed(recording, made.records(0.01))
+        recording.close()
+        left = sorted(file.suffix for file in folder.iterdir())
+        assert left == (sorted([".rrd", ".log", *([".json"] if sidecars else [])]) if ran or named else [])
 
 
 def test_a_file_asked_for_by_name_is_written_anew(tmp_path: Path) -> None:
@@ -411,6 +439,7 @@ def test_captured_frames_are_a_log_that_python_can_reads(tmp_path: Path) -> None
     ]
     for number, frame in enumerate(seen):
         recording.frames(CAPTURED.pack(1_795_245_300.25 + number, frame))
+    feed(recording, made.records(0.01))
     recording.close()
     with can.CanutilsLogReader(recording.path.with_suffix(".log")) as log:
         first, second, third, fourth, fifth = log
@@ -470,6 +499,7 @@ def test_a_batch_of_frames_that_the_disk_takes_in_part_leaves_no_part(tmp_path: 
 def test_frames_are_not_kept_unless_asked_for(tmp_path: Path) -> None:
     recording = recorder(tmp_path)
     recording.frames(CAPTURED.pack(1.0, Frame(0x201).packed))
+    feed(recording, made.records(0.01))
     recording.close()
     assert [path.suffix for path in tmp_path.iterdir()] == [".rrd"]
 

@@ -166,15 +166,15 @@ def main(
     """
     offer_to_oom_killer()  # a recorder that has ended is restarted, and the robot moves on
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
-    intake = Intake(config, record, link, ready)
-    release_startup_memory()
     ending, received = False, 0
 
     def end(_signal: int, _frame: object) -> None:
         nonlocal ending
         ending = True
 
-    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGTERM, end)  # before a file is created, which is deleted if the service does not start
+    intake = Intake(config, record, link, ready)
+    release_startup_memory()
     poll = select.poll()
     poll.register(link.fileno(), select.POLLIN)
     sent_at = -math.inf

@@ -265,7 +265,7 @@ class Recorder:
         self._unwritten.clear()
 
     def close(self) -> None:
-        """Write the remaining data and finish the file.
+        """Write the remaining data and finish the file. Delete a file of `directory` that has no cycle.
 
         If the disk or a viewer does not respond, this method waits for at most a few seconds.
         """
@@ -274,9 +274,13 @@ class Recorder:
             self._streams.log("warning", words)
             self._streams.save()
         self._files.close()
-        self._write_sidecar()
         if self._frames:
             self._frames.close()
+        if self._last is None and self._own_folder is not None:  # the service could not start
+            with contextlib.suppress(OSError):
+                retention.delete(self.path)
+        else:
+            self._write_sidecar()
         if self._live:
             self._live.close()
 

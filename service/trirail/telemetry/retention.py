@@ -32,6 +32,12 @@ def sidecar(recording: Path) -> Path:
     return recording.with_name(f"{recording.name}.json")
 
 
+def delete(recording: Path) -> None:
+    """Delete a recording with its log of CAN frames and its sidecar, as far as they exist. Raises OSError."""
+    for path in (recording, recording.with_suffix(".log"), sidecar(recording)):
+        path.unlink(missing_ok=True)
+
+
 class _StoredRecording(NamedTuple):
     path: Path
     size: int
@@ -41,12 +47,6 @@ class _StoredRecording(NamedTuple):
     Recordings are sorted by date, number and part in their names, the running session after all others, and black boxes
     last.
     """
-
-    @property
-    def files(self) -> list[Path]:
-        """Recording file and, if they exist, the log of CAN frames and the sidecar that belong to the recording."""
-        beside = (self.path, self.path.with_suffix(".log"), sidecar(self.path))
-        return [path for path in beside if path.exists()]
 
 
 def lock(path: Path) -> int:
@@ -111,8 +111,7 @@ def tidy(directory: Path, at_most: float, session: str = "") -> Tidied:
         try:
             if is_being_written(kept.path):
                 continue
-            for path in kept.files:
-                path.unlink()
+            delete(kept.path)
         except FileNotFoundError:  # another process has just deleted the recording
             pass
         except OSError as error:
