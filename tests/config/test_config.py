@@ -24,6 +24,7 @@ from trirail.config import (
     PlatformLimits,
     SliderLimits,
     Zenoh,
+    everything,
     geometry,
     impossible,
     load,
@@ -92,6 +93,36 @@ def test_shipped_configurations_load(path: Path) -> None:
             "the port must be 1 to 65535: an endpoint is protocol/address, such as",
         ),
         (LISTEN, f'{LISTEN}\nconnect = ["tcp/hub"]', "zenoh.connect[0] = 'tcp/hub': the port is missing"),
+        (
+            LISTEN,
+            'listen = ["tpc/127.0.0.1:7447"]',
+            "zenoh.listen[0] = 'tpc/127.0.0.1:7447': the protocol tpc is unknown: use tcp, tls or unixsock-stream",
+        ),
+        (
+            LISTEN,
+            'listen = ["unixsock//tmp/x"]',
+            "zenoh.listen[0] = 'unixsock//tmp/x': the protocol unixsock is unknown: use tcp, tls or unixsock-stream",
+        ),
+        (
+            LISTEN,
+            'listen = ["unixsock-stream/~/x"]',
+            "zenoh.listen[0] = 'unixsock-stream/~/x': the path ~/x is relative: use an absolute path, such as",
+        ),
+        (
+            LISTEN,
+            'listen = ["unixsock-stream//tmp/x", "unixsock-stream//tmp/x.stop"]',
+            "zenoh.listen[1]: /tmp/x.stop is also a file of zenoh.listen[0]; use another name for the socket",
+        ),
+        (
+            LISTEN,
+            'listen = ["unixsock-stream//tmp/x.lock", "tcp/127.0.0.1:7447", "unixsock-stream//tmp//x"]',
+            "zenoh.listen[2]: /tmp/x.lock is also a file of zenoh.listen[0]; use another name for the socket",
+        ),
+        (
+            LISTEN,
+            'listen = ["unixsock-stream//tmp/x", "unixsock-stream//tmp/./x"]',
+            "zenoh.listen[1]: /tmp/x is also a file of zenoh.listen[0]; use another name for the socket",
+        ),
         (LISTEN, 'listen = ["tcp/127.0.0.1:9876"]', "telemetry.live_port: port 9876 is also that of zenoh.listen[0]"),
         ("live_port = 9876", "live_port = 7447", "telemetry.live_port: port 7447 is also that of zenoh.listen[0]; use"),
         (
@@ -732,3 +763,25 @@ def test_a_recording_of_an_earlier_version_is_read_although_its_configuration_wo
     recorded = provenance.configuration({provenance.CONFIGURATION: text})
     assert recorded is not None
     assert recorded.poses["far"] == (9.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ('directory = "recordings"', 'directory = "~/x"'),
+        (LISTEN, f'{TLS}\ndirectory = "~/x"'),
+        ("[telemetry]", '[correction]\nmap = "~/x"\n[telemetry]'),
+        ("[drives.A]", '[drives.A]\neds = "~/x"'),
+        ("[drives.A]", '[drives.A]\nendpoints = "~/x"'),
+    ],
+)
+def test_a_path_may_begin_with_the_home_folder(
+    before: str, after: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise the service would make a folder whose name is ~."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert before in TEXT
+    (tmp_path / "robot.toml").write_text(TEXT.replace(before, after, 1))
+    found = str(everything(tmp_path / "robot.toml"))
+    assert f"{tmp_path}/home/x" in found
+    assert f"{tmp_path}/~" not in found

@@ -14,7 +14,7 @@ from trirail_drivers.interface import NAMES
 from trirail.config import as_built
 from trirail.config.explained import Mistake, leaves, repaired
 from trirail.config.impossible import check, mistakes
-from trirail.config.tables import Config, FramesTable, Limits
+from trirail.config.tables import Config, FramesTable, Limits, resolved
 from trirail.errors import ConfigError
 from trirail.wire.decoding import prepare
 
@@ -117,17 +117,17 @@ def _resolve_paths(path: Path, config: Config, wrong: list[Mistake]) -> Config:
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
         named = {key: getattr(drive, key) for key in ("eds", "endpoints")}
-        resolved = {key: str(path.parent / file) for key, file in named.items() if file is not None}
-        drives = msgspec.structs.replace(drives, **{name: msgspec.structs.replace(drive, **resolved)})
+        files_of = {key: resolved(file, path.parent) for key, file in named.items() if file is not None}
+        drives = msgspec.structs.replace(drives, **{name: msgspec.structs.replace(drive, **files_of)})
     correction = config.correction
     if correction.map is not None and correction.as_built is None:
-        file = path.parent / correction.map
+        file = resolved(correction.map, path.parent)
         try:
-            correction = msgspec.structs.replace(correction, map=str(file), as_built=as_built.read(file))
+            correction = msgspec.structs.replace(correction, map=file, as_built=as_built.read(Path(file)))
         except ConfigError as error:
             wrong.append(Mistake("correction.map", f"correction.map: {error}"))
     telemetry = config.telemetry
     if not path.resolve().is_relative_to(SIM.parent):  # recordings are never written next to the shipped files
-        telemetry = msgspec.structs.replace(telemetry, directory=str(path.parent / telemetry.directory))
+        telemetry = msgspec.structs.replace(telemetry, directory=resolved(telemetry.directory, path.parent))
     zenoh = config.zenoh.beside(path.parent)
     return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction, telemetry=telemetry)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import os
 from pathlib import Path
 from typing import Annotated, Literal, cast
 
@@ -267,6 +268,11 @@ class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
         return 0 if self.realtime == "off" else round(self.busy_wait * 1e9)
 
 
+def resolved(path: str, folder: Path) -> str:
+    """Return a path of a configuration file in `folder`, to which it is relative. A leading ~ is the home folder."""
+    return str(folder / os.path.expanduser(path))
+
+
 class Tls(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [zenoh.tls]: users need a certificate to connect and a role to do anything."""
 
@@ -300,7 +306,7 @@ class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
         """Return the section with its certificate folder resolved relative to `folder`, the folder of the file."""
         if self.tls is None:
             return self
-        return structs.replace(self, tls=structs.replace(self.tls, directory=str(folder / self.tls.directory)))
+        return structs.replace(self, tls=structs.replace(self.tls, directory=resolved(self.tls.directory, folder)))
 
 
 class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
