@@ -351,6 +351,17 @@ def test_a_file_that_is_no_socket_is_kept_and_told_with_the_remedy(tmp_path: Pat
         pass
 
 
+def test_a_socket_on_which_another_program_listens_is_left_alone(tmp_path: Path) -> None:
+    guard = Guard(msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=(f"unixsock-stream/{tmp_path}/z",))))
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(f"{tmp_path}/z.stop")
+        other.listen()
+        guard.stop_port(lambda *_: None).close()
+        assert any(f"no stop port at {tmp_path}/z.stop (address already in use" in said for said in guard.warnings())
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(f"{tmp_path}/z.stop")
+
+
 ELSEWHERE = "192.0.2.1"
 
 

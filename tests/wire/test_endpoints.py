@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ipaddress
+import socket
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -111,6 +113,30 @@ def test_an_ipv6_address_is_in_brackets_and_a_file_needs_no_port() -> None:
         assert "[::1]:7447" in fault_of(bare)
     assert fault_of("unixsock-stream//run/trirail/zenoh") == ""
     assert fault_of("unixsock-stream/").startswith("the address is missing")
+
+
+@given(st.text("abcdefghijklmnopqrstuvwxyz-", min_size=1, max_size=12), st.sampled_from(ENDS))
+def test_a_protocol_that_zenoh_lacks_is_named(protocol: str, end: str) -> None:
+    fault = fault_of(f"{protocol}/127.0.0.1:7447{end}")
+    assert fault == f"the protocol {protocol} is unknown: use tcp, tls or unixsock-stream"
+
+
+@given(st.integers(95, 115), st.sampled_from("a\u00e9\u20ac"))
+def test_each_path_that_is_accepted_has_room_for_the_stop_port_too(length: int, letter: str) -> None:
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder, socket.socket(socket.AF_UNIX) as listening:
+        path = f"{folder}/"
+        path += letter * ((length - len(path)) // len(letter.encode()))
+        stop = stop_address(f"unixsock-stream/{path}")
+        assert stop is not None
+        if fault_of(f"unixsock-stream/{path}"):
+            with pytest.raises(OSError, match="too long"):
+                listening.bind(stop.where)
+        else:
+            listening.bind(stop.where)
+    relative = fault_of(f"unixsock-stream{path}")
+    assert relative == f"the path {path.lstrip('/')} is relative: use an absolute path, such as " + (
+        "unixsock-stream//run/trirail/zenoh"
+    )
 
 
 @pytest.mark.parametrize(

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import ipaddress
 import itertools
+import os
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 from trirail_drivers.driver.requirements import Rule
 
 from trirail.config.tables import Config, Zenoh
 from trirail.errors import ConfigError
-from trirail.wire.endpoints import ReachableBy, fault_of, reach, same_port, tcp_address
-from trirail.wire.stop_protocol import stop_address
+from trirail.wire.endpoints import ReachableBy, fault_of, reach, same_port, socket_file, tcp_address
+from trirail.wire.stop_protocol import SUFFIX, stop_address
 
 
 def network_rules(config: Config) -> Iterator[Rule]:
@@ -24,6 +26,10 @@ def network_rules(config: Config) -> Iterator[Rule]:
     for first, second in itertools.combinations(_listeners(config), 2):
         if not (first.is_stop_port and second.is_stop_port and first.endpoint_port == second.endpoint_port):
             yield Rule(second.key, (first.key, "telemetry.metrics_address"), partial(_check_port, first, second))
+    sockets = {f"zenoh.listen[{index}]": socket_file(at) for index, at in enumerate(config.zenoh.listen)}
+    for (first_key, file), (key, other) in itertools.combinations(sockets.items(), 2):
+        if file is not None and other is not None:
+            yield Rule(key, (first_key,), partial(_check_files, first_key, file, key, other))
 
 
 class _Listener(NamedTuple):
@@ -67,6 +73,17 @@ def _check_port(first: _Listener, second: _Listener) -> None:
     if same_port(first.address, second.address):
         port = f"{'stop port' if second.is_stop_port else 'port'} {second.address[1]}"
         raise ConfigError(f"{second.key}: {port} is also {first.port_name}; use different ports")
+
+
+def _check_files(first_key: str, first: Path, key: str, other: Path) -> None:
+    """Refuse a Unix socket that shares a file with another one: the socket, its lock or the socket of its stop port."""
+    if shared := _files(first) & _files(other):
+        raise ConfigError(f"{key}: {min(shared)} is also a file of {first_key}; use another name for the socket")
+
+
+def _files(socket: Path) -> set[str]:
+    path = os.path.normpath(socket)
+    return {path, f"{path}.lock", f"{path}{SUFFIX}"}
 
 
 def _check_metrics(config: Config) -> None:

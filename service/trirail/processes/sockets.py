@@ -120,10 +120,9 @@ class Reserve:
 def listen(address: StopAddress) -> list[socket.socket]:
     """Listen on a Unix socket, or on every address of a host name that this machine has. Raises OSError on failure."""
     if isinstance(address.where, str):
-        # A gateway that was killed may have left the socket. Zenoh's lock file shows that no other gateway is running.
         file = Path(address.where)
         if file.is_socket():
-            file.unlink()
+            _remove_unused(address.where)
         elif os.path.lexists(file):
             raise FileExistsError(errno.EEXIST, "this file exists and is not a socket; move it away", address.where)
         places: list[tuple[socket.AddressFamily, Any]] = [(socket.AF_UNIX, address.where)]
@@ -141,6 +140,15 @@ def listen(address: StopAddress) -> list[socket.socket]:
                     close(opened)
                 raise
     return listening
+
+
+def _remove_unused(file: str) -> None:
+    """Remove a Unix socket that a killed gateway has left. Raises OSError if a program listens on the socket."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        if probe.connect_ex(file) != errno.ECONNREFUSED:
+            raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE), file)
+    os.unlink(file)
 
 
 def close(listening: socket.socket) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 from enum import StrEnum
 from pathlib import Path
@@ -11,6 +12,10 @@ DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
 """Endpoint at which a service listens by default."""
 ENDPOINT_SYNTAX = "an endpoint is protocol/address, such as tcp/127.0.0.1:7447"
 _WITH_PORT = frozenset({"tcp", "tls", "udp", "quic", "ws"})
+_UNIX = "unixsock-stream"
+SOCKET_SYNTAX = f"use an absolute path, such as {_UNIX}//run/trirail/zenoh"
+MAX_SOCKET_PATH = 102
+"""Maximum length of the path of a Unix socket [bytes]. The kernel allows 107, unix(7), also for PATH.stop."""
 LAST_PORT = 65535
 _HOST_NAME = re.compile(
     r"(?=.{1,253}$)[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?)*"
@@ -34,8 +39,10 @@ def fault_of(endpoint: str) -> str:
         return f"the protocol is missing: {ENDPOINT_SYNTAX}"
     if not address:
         return f"the address is missing: {ENDPOINT_SYNTAX}"
+    if protocol == _UNIX:
+        return _fault_of_path(address)
     if protocol not in _WITH_PORT:
-        return ""
+        return f"the protocol {protocol} is unknown: use tcp, tls or {_UNIX}"
     host, colon, port = address.rpartition(":")
     if address.endswith("]") or not colon:
         return f"the port is missing: {ENDPOINT_SYNTAX}"
@@ -46,6 +53,13 @@ def fault_of(endpoint: str) -> str:
     if not (port.isascii() and port.isdigit() and len(port) <= len(str(LAST_PORT)) and 1 <= int(port) <= LAST_PORT):
         return f"the port must be 1 to {LAST_PORT}: {ENDPOINT_SYNTAX}"
     return ""
+
+
+def _fault_of_path(path: str) -> str:
+    if not path.startswith("/"):
+        return f"the path {path} is relative: {SOCKET_SYNTAX}"
+    length = len(os.fsencode(path))
+    return f"the path has {length} bytes: use a path of at most {MAX_SOCKET_PATH}" if length > MAX_SOCKET_PATH else ""
 
 
 def tcp_address(endpoint: str) -> tuple[str, int] | None:
@@ -110,7 +124,7 @@ def reach(endpoint: str) -> ReachableBy:
     protocol = endpoint.partition("/")[0]
     if protocol == "tls":
         return ReachableBy.CERTIFICATE
-    if protocol == "unixsock-stream":
+    if protocol == _UNIX:
         return ReachableBy.FILE
     return ReachableBy.MACHINE if is_local(endpoint) else ReachableBy.NETWORK
 
@@ -123,14 +137,14 @@ def endpoint_of(address: str, port: int) -> str:
 def socket_file(endpoint: str) -> Path | None:
     """Return the file of a Unix-socket endpoint; None if the endpoint has another protocol."""
     protocol, address = _parts(endpoint)
-    return Path(address) if protocol == "unixsock-stream" else None
+    return Path(address) if protocol == _UNIX else None
 
 
 def is_local(endpoint: str) -> bool:
     """Return True if only programs on this machine can connect to an endpoint."""
     protocol, address = _parts(endpoint)
     host = address.rpartition(":")[0].removeprefix("[").removesuffix("]")
-    if protocol in {"unixsock-stream", "unixpipe"} or host == "localhost":
+    if protocol in {_UNIX, "unixpipe"} or host == "localhost":
         return True
     try:
         return ipaddress.ip_address(host).is_loopback
