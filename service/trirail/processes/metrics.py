@@ -252,8 +252,14 @@ class _Handler(WSGIRequestHandler):
     slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
 
     def handle(self) -> None:
-        if not self.slots.acquire(blocking=False):
-            return  # the connection is closed
+        if self.slots.acquire(blocking=False):  # otherwise, the connection is closed
+            try:
+                self._handle_in_time()
+            finally:
+                self.slots.release()
+
+    def _handle_in_time(self) -> None:
+        """Handle the request, and end the connection after CONNECTION_TIMEOUT_S."""
         # A time-out of the socket would apply to each byte that a slow client sends.
         end = threading.Timer(CONNECTION_TIMEOUT_S, self._disconnect)
         end.daemon = True
@@ -267,7 +273,6 @@ class _Handler(WSGIRequestHandler):
         finally:
             end.cancel()
             end.join()  # afterwards, another connection may get the descriptor
-            self.slots.release()
 
     def _disconnect(self) -> None:
         """End the connection, for which the handler may wait in another thread."""
