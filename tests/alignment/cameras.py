@@ -50,10 +50,11 @@ class Stage:
         views: Mapping[str, CameraView],
         part: Mapping[str, Pair],
         rng: np.random.Generator,
-        noise: float = 0.0,
+        noise: float | Mapping[str, float] = 0.0,
         moved: Callable[[Triple], Triple] = lambda by: by,
     ) -> None:
-        self.views, self.part, self._rng, self._noise, self._moved = dict(views), dict(part), rng, noise, moved
+        self.views, self.part, self._rng, self._moved = dict(views), dict(part), rng, moved
+        self._noise = noise if isinstance(noise, Mapping) else dict.fromkeys(part, noise)
         self.pose: Triple = (0.0, 0.0, 0.0)
         self.way = 0.0
         """The longest of the motions that were made about a point [m]."""
@@ -73,7 +74,7 @@ class Stage:
             name: project_points(self.views[name], to_base_frame(q, self.true_pose)[None])[0]
             for name, q in self.part.items()
         }
-        noisy = {name: (at + self._noise * self._rng.standard_normal(2)).tolist() for name, at in seen.items()}
+        noisy = {name: (at + self._noise[name] * self._rng.standard_normal(2)).tolist() for name, at in seen.items()}
         return {name: (u, v) for name, (u, v) in noisy.items()}
 
     def go(self, motion: StageMotion) -> None:

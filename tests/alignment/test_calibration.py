@@ -1,6 +1,7 @@
 """Calibration from moves: against exact cameras of all kinds, by its covariance, and what it refuses."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, calibrate, to_base_frame
 from trirail.alignment.images import LENSES, Lens, locate_pixels, project_points, projection_jacobians
+from trirail.alignment.misalignment import measure_misalignment
 from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves, calibration_moves
 from trirail.errors import AlignmentError, AlignmentFault, RefusedError
 from trirail_drivers.interface import Triple
@@ -24,7 +26,7 @@ MORE: tuple[Triple, ...] = (
 PART = {"left": (-0.06, 0.01), "right": (0.055, -0.005)}
 
 
-def two_cameras(seed: int, lens: Lens = "affine", noise: float = 0.0) -> Stage:
+def two_cameras(seed: int, lens: Lens = "affine", noise: float | Mapping[str, float] = 0.0) -> Stage:
     rng = np.random.default_rng(seed)
     return Stage({name: camera(rng, place, lens) for name, place in PART.items()}, PART, rng, noise)
 
@@ -80,18 +82,63 @@ def test_places_are_the_inverse_of_pixels_and_slopes_their_derivative(seed: int,
         assert projection_jacobians(view, points)[:, :, axis] == pytest.approx(difference, rel=1e-5, abs=1.0)
 
 
-def test_its_noise_and_deviations_are_those_that_there_are() -> None:
-    marks, noises = [], []
+UNEQUAL = {"left": 0.05, "right": 1.0}
+"""Noise of the pictures of two cameras [pixel]."""
+
+
+@pytest.mark.parametrize("noise", [dict.fromkeys(PART, 0.1), UNEQUAL], ids=["equal", "unequal"])
+def test_noise_and_deviations_of_each_camera_are_those_of_many_trials(noise: dict[str, float]) -> None:
+    stage = two_cameras(0, noise=noise)
+    trials = []
     for seed in range(300):
-        stage = two_cameras(0, noise=0.1)
-        stage._rng = np.random.default_rng(1000 + seed)
-        found = stage.drive(calibrate_by_moves())
-        noises.append(found.noise**2)
-        marks.append(
-            [(np.array(found.marks[name].place) - q) / found.marks[name].deviation for name, q in PART.items()]
-        )
-    assert math.sqrt(np.mean(noises)) == pytest.approx(0.1, rel=0.03)
-    assert np.mean(np.square(marks)) == pytest.approx(1.0, abs=0.35)  # t-distributed, of 12 degrees of freedom
+        stage.reseed(1000 + seed)
+        trials.append(stage.drive(calibrate_by_moves()))
+    for name, place in PART.items():
+        noises = np.array([found.noise_of(name) for found in trials])
+        errors = np.array([np.subtract(found.marks[name].place, place) for found in trials])
+        deviations = np.array([found.marks[name].deviation for found in trials])
+        assert (noises**2).mean() == pytest.approx(noise[name] ** 2, rel=0.15)
+        assert (deviations**2).mean() == pytest.approx((errors**2).mean(), rel=0.3)
+    assert np.mean([found.noise**2 for found in trials]) == pytest.approx(
+        np.mean(np.square([*noise.values()])), rel=0.15
+    )
+
+
+def test_a_view_with_few_degrees_of_freedom_has_the_noise_of_all_views() -> None:
+    """Seven looks of one mark leave six degrees of freedom, six looks leave four, and five leave two."""
+    stage = two_cameras(0, noise=UNEQUAL)
+    samples = []
+    for pose in ((0.0, 0.0, 0.0), *DEFAULT_MOVES):
+        stage.pose = pose
+        samples.append(CalibrationSample(pose, stage.look()))
+    for hidden in ((), (2,), (2, 4)):
+        looks = [
+            each._replace(marks={name: at for name, at in each.marks.items() if name == "right" or n not in hidden})
+            for n, each in enumerate(samples, 1)
+        ]
+        found = calibrate(looks)
+        assert found.noise_of("right") == pytest.approx(1.0, rel=0.6)
+        assert (found.noise_of("left") < 0.1) == (len(hidden) < 2)
+        assert (found.noise_of("left") == pytest.approx(found.noise)) == (len(hidden) == 2)
+
+
+def test_an_alignment_weighs_each_camera_by_its_own_noise() -> None:
+    """The errors of the measured misalignment are as large as is said, and a third mark helps by what it is worth."""
+    part = {**PART, "middle": (0.0, 0.03)}
+    rng = np.random.default_rng(0)
+    views = {name: camera(rng, place) for name, place in part.items()}
+    stage = Stage(views, part, rng, noise={"left": 0.05, "middle": 0.05, "right": 1.0})
+    calibration = stage.drive(calibrate_by_moves(looks=16))
+    targets = {name: (float(u), float(v)) for name, (u, v) in Stage(views, part, rng).look().items()}
+    turns, places, said = [], [], []
+    for _ in range(200):
+        found = measure_misalignment(calibration, stage.look(), targets)
+        turns.append(found.motion.turn)
+        places.append(found.motion.displacements(found.positions))
+        said.append(found.deviations(math.sqrt(calibration.looks)))
+    place, turn = np.sqrt(np.mean(np.square(said), axis=0))
+    assert np.std(turns) == pytest.approx(turn, rel=0.3)
+    assert np.std(places, axis=0).max(axis=0).max() == pytest.approx(place, rel=0.3)
 
 
 def test_marks_that_stand_still_are_refused() -> None:

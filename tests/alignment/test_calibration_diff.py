@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -15,17 +17,24 @@ from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.procedure import StageMotion, calibrate_by_moves, calibration_moves, repeat_calibration
 from trirail.alignment.rigid_motion import rotation_matrix
+from trirail.client import calibration_file
 from trirail_drivers.interface import Triple
 
 PART: dict[str, Pair] = {"left": (-0.06, 0.01), "right": (0.06, 0.01)}
 seeds = st.integers(0, 2**32 - 1)
 
 
-def compared(seed: int, shift: Pair = (0.0, 0.0), turn: float = 0.0, scale: float = 0.0) -> list[ViewChange]:
+def compared(
+    seed: int,
+    shift: Pair = (0.0, 0.0),
+    turn: float = 0.0,
+    scale: float = 0.0,
+    noise: float | dict[str, float] = 0.1,
+) -> list[ViewChange]:
     """Return the changes of two cameras, of which the left is shifted [m], turned and brought nearer; another part."""
     rng = np.random.default_rng(seed)
     views = {name: camera(rng, place) for name, place in PART.items()}
-    stage = Stage(views, PART, rng, noise=0.1)
+    stage = Stage(views, PART, rng, noise=noise)
     kept: CameraCalibration = stage.drive(calibrate_by_moves(looks=4))
     left = views["left"]
     (a, b), (c, d) = ((1.0 + scale) * rotation_matrix(turn) @ np.array(left.matrix)).tolist()
@@ -44,6 +53,14 @@ def test_a_shift_is_told_though_the_part_is_another(seed: int, way: float, direc
     for found, deviation, real in zip(left.shift, left.shift_deviation, shift, strict=True):
         assert abs(found - real) < 6.0 * deviation
         assert deviation < 3e-5
+    assert not right.is_changed
+
+
+@given(seeds, st.floats(2e-4, 5e-4))
+def test_a_noisy_camera_hides_no_shift_of_another_and_gives_no_alarm(seed: int, way: float) -> None:
+    left, right = compared(seed, (way, 0.0), noise={"left": 0.1, "right": 2.0})
+    assert left.is_shifted
+    assert abs(left.shift[0] - way) < 6.0 * left.shift_deviation[0]
     assert not right.is_changed
 
 
@@ -188,6 +205,29 @@ def test_a_calibration_of_an_earlier_version_has_no_approach() -> None:
     assert msgspec.convert(fields, CameraCalibration).approach == kept.approach
     del fields["approach"]
     assert msgspec.convert(fields, CameraCalibration) == msgspec.structs.replace(kept, approach=None)
+
+
+def test_a_calibration_of_an_earlier_version_gets_the_noise_of_each_view(tmp_path: Path) -> None:
+    """Its covariances follow from one noise of all views. The residuals in the file give those of each view."""
+    rng = np.random.default_rng(3)
+    stage = Stage({name: camera(rng, place) for name, place in PART.items()}, PART, rng, {"left": 0.1, "right": 2.0})
+    found: CameraCalibration = stage.drive(calibrate_by_moves(looks=4))
+    file = tmp_path / "camera.json"
+    calibration_file.write(file, "robot", found, {})
+    assert calibration_file.read(file).calibration == found
+    content = json.loads(file.read_bytes())
+    old = content["calibration"]
+    del old["noises"]
+    for view, covariance in old["covariances"].items():
+        share = found.noise / found.noise_of(view)
+        old["covariances"][view] = (share**2 * np.array(covariance)).tolist()
+        old["marks"][view]["deviation"] = (share * np.array(old["marks"][view]["deviation"])).tolist()
+    file.write_text(json.dumps(content))
+    again = calibration_file.read(file).calibration
+    assert again.noises == pytest.approx(found.noises)
+    for name, mark in found.marks.items():
+        assert again.marks[name].deviation == pytest.approx(mark.deviation)
+        assert np.array(again.covariances[name]) == pytest.approx(np.array(found.covariances[name]))
 
 
 def test_an_approach_of_other_numbers_can_be_written() -> None:

@@ -136,9 +136,9 @@ def observe_mean(count: int) -> Generator[AlignmentRequest, Observation, Observa
     return average((yield from capture(count)))
 
 
-def single_picture_noise(calibration: CameraCalibration) -> float:
-    """Return the standard deviation of the u or v of a mark in a single picture [pixel]."""
-    return calibration.noise * math.sqrt(calibration.looks)
+def single_picture_noise(calibration: CameraCalibration, view: str) -> float:
+    """Return the standard deviation of the u or v of a mark of a view in a single picture [pixel]."""
+    return calibration.noise_of(view) * math.sqrt(calibration.looks)
 
 
 def _compare(
@@ -151,11 +151,12 @@ def _compare(
     """
     miss = travel = 0.0
     for name in sorted(set(before.marks) & set(picture.marks) & set(calibration.marks)):
-        view = calibration.views[calibration.marks[name].view]
+        shown_by = calibration.marks[name].view
+        view = calibration.views[shown_by]
         start, observed = locate_pixels(view, np.array([before.marks[name], picture.marks[name]]))
         predicted = _move_with_platform(start, before.pose, picture.pose)
         # Variance of the difference: 1 for the picture plus 1/count for the look, in each of two coordinates.
-        noise = single_picture_noise(calibration) / view.scale * math.sqrt(2.0 * (1.0 + 1.0 / count))
+        noise = single_picture_noise(calibration, shown_by) / view.scale * math.sqrt(2.0 * (1.0 + 1.0 / count))
         miss = max(miss, float(np.linalg.norm(observed - predicted)) - NOISE_DEVIATIONS * noise)
         travel = max(travel, float(np.linalg.norm(predicted - start)))
     return miss, travel

@@ -20,7 +20,13 @@ from trirail_drivers.interface import Triple
 from trirail.alignment import arguments
 from trirail.alignment.alignment_request import AlignmentRequest, LookReport, Observation, StageMotion
 from trirail.alignment.calibration_procedure import DEFAULT_MOVES, PLATFORM_CENTRE, ZERO_OFFSET, plain_approach
-from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, MarkFit, fit_cameras
+from trirail.alignment.camera_calibration import (
+    CalibrationSample,
+    CameraCalibration,
+    MarkFit,
+    fit_cameras,
+    separate_noises,
+)
 from trirail.alignment.fresh_pictures import average, capture
 from trirail.alignment.images import Lens, Pair
 from trirail.alignment.pose_plan import choose_poses, find_candidates
@@ -444,4 +450,6 @@ def calibrated_cameras(
         if used:
             residuals[number][name] = (residual[0], residual[1])
     at = tuple((x, y, phi) for x, y, phi in poses.tolist())
-    return CameraCalibration(dict(state.views), marks, fit.noise, tuple(residuals), at, covariances, looks=pictures)
+    return separate_noises(
+        CameraCalibration(dict(state.views), marks, fit.noise, tuple(residuals), at, covariances, looks=pictures)
+    )

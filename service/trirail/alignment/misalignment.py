@@ -70,7 +70,7 @@ def measure_misalignment(
 ) -> Misalignment:
     """Compute the misalignment of a part.
 
-    Each mark is weighted by the inverse covariance of its position, which follows from the noise of the calibration.
+    Each mark is weighted by the inverse covariance of its position, which follows from the noise of its view.
 
     Parameters
     ----------
@@ -94,7 +94,8 @@ def measure_misalignment(
         reason = f"not found: {absent}; check light and focus" if absent else "give targets for more marks"
         text = f"{len(names)} marks found, at least {MIN_MARKS} are needed; {reason}"
         raise AlignmentError(AlignmentFault.MISSING, text, value=float(len(names)), limit=float(MIN_MARKS))
-    views = [calibration.views[calibration.marks[name].view] for name in names]
+    shown_by = [calibration.marks[name].view for name in names]
+    views = [calibration.views[view] for view in shown_by]
     at = _locate_marks(views, [marks[name] for name in names])
     to = _locate_marks(views, [targets[name] for name in names])
     for (one, place), (other, beside) in itertools.combinations(zip(names, to, strict=True), 2):
@@ -119,7 +120,8 @@ def measure_misalignment(
             "another part, a mistaken mark, a camera that was moved since its calibration, and heat"
         )
         raise AlignmentError(AlignmentFault.DISTANCE, text, value=error, limit=distance)
-    weights = np.stack([_inverse_covariance(view, q, calibration.noise) for view, q in zip(views, at, strict=True)])
+    noises = [calibration.noise_of(view) for view in shown_by]
+    weights = np.stack([_inverse_covariance(*each) for each in zip(views, at, noises, strict=True)])
     return Misalignment(names, at, to, fit_rigid_motion(at, to, weights), error)
 
 

@@ -46,11 +46,13 @@ def show_calibration(result: CameraCalibration, file: Path) -> None:
     """Print the results of a calibration and the file in which it is saved."""
     for name, view in result.views.items():
         mirrored = ", mirrored" if view.mirrored else ""
-        terminal.print_line(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
+        terminal.print_line(
+            f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}, residual {result.noise_of(name):.3f} pixel"
+        )
     for name, mark in result.marks.items():
         (x, y), (dx, dy) = mark.place, mark.deviation
         terminal.print_line(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
-    terminal.print_line(f"residual {result.noise:.3f} pixel; kept in {file}")
+    terminal.print_line(f"kept in {file}")
 
 
 def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+from msgspec import structs
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
-from trirail.alignment.camera_calibration import CameraCalibration, Marks
+from trirail.alignment.camera_calibration import CameraCalibration, Marks, separate_noises
 from trirail.alignment.images import Pair
 from trirail.wire.decoding import INVALID, decoded, prepare
 
@@ -84,7 +85,11 @@ def read(path: Path) -> CalibrationFile:
         raise FileError(f"{path}: no such file; create it with trirail align calibrate")
     text = files.text(path)
     try:
-        return decoded(text, CalibrationFile)
+        content = decoded(text, CalibrationFile)
     except INVALID as error:
         problem = str(error).replace("`", "")
         raise FileError(f"{path}: {problem}; create it again with trirail align calibrate") from error
+    if content.calibration.noises:
+        return content
+    # Earlier versions wrote one noise for all views, from which all covariances follow.
+    return structs.replace(content, calibration=separate_noises(content.calibration))
