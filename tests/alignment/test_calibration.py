@@ -123,7 +123,7 @@ def test_a_view_with_few_degrees_of_freedom_has_the_noise_of_all_views() -> None
 
 
 def test_an_alignment_weighs_each_camera_by_its_own_noise() -> None:
-    """The errors of the measured misalignment are as large as is said, and a third mark helps by what it is worth."""
+    """The errors are as large as is said, and no larger than those of the two marks that are seen precisely."""
     part = {**PART, "middle": (0.0, 0.03)}
     rng = np.random.default_rng(0)
     views = {name: camera(rng, place) for name, place in part.items()}
@@ -138,6 +138,9 @@ def test_an_alignment_weighs_each_camera_by_its_own_noise() -> None:
         said.append(found.deviations(math.sqrt(calibration.looks)))
     place, turn = np.sqrt(np.mean(np.square(said), axis=0))
     assert np.std(turns) == pytest.approx(turn, rel=0.3)
+    coarsest = min(views[name].scale for name in ("left", "middle"))
+    precise = math.sqrt(2.0) * 0.05 / coarsest / math.dist(part["left"], part["middle"])
+    assert np.std(turns) < 1.3 * precise
     assert np.std(places, axis=0).max(axis=0).max() == pytest.approx(place, rel=0.3)
 
 
