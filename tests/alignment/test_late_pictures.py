@@ -75,6 +75,48 @@ def test_reached_is_never_said_of_a_part_that_lies_wrong(seed: int, noise: float
         assert found.why is not AlignmentEnd.GROWING
 
 
+@pytest.mark.parametrize("how", ["0", "1", "2", "4"])
+@pytest.mark.parametrize("looks", [1, 4])
+@pytest.mark.generated(*range(20))
+def test_a_late_camera_and_a_correction_within_the_noise_end_at_the_right_place(
+    seed: int, looks: int, how: str
+) -> None:
+    """An old picture agrees with so small a motion, and would show the part right after a correction too many."""
+    rng = np.random.default_rng(seed)
+    stage, calibration, targets = ready(seed, noise := 0.05)
+    wanted = stage.part
+    angle, far = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(2e-6, 3e-6)
+    stage.part = part_at(wanted, (far * math.cos(angle), far * math.sin(angle), 0.0))
+    stage.look = LateCamera(stage, how, rng)  # type: ignore[method-assign]
+    for _ in range(5):
+        stage.look()
+    confirmed = msgspec.structs.replace(calibration, confirmed=True)
+    found = stage.drive(align(AlignmentTask(confirmed, targets, tolerance=1e-6, angle=2.4e-5, looks=looks)))
+    assert found.reached
+    scale = min(view.scale for view in calibration.views.values())
+    assert left(stage, stage.part, wanted) < 1e-6 + 3.0 * noise / scale
+
+
+@pytest.mark.generated(*range(12))
+def test_reached_after_a_correction_is_repeated_by_further_pictures(seed: int) -> None:
+    """Also if a camera delivers a single old picture, which shows the part where the correction should bring it."""
+    stage, calibration, targets = ready(seed, noise=0.02)
+    stage.part = part_at(stage.part, (5e-5, -3e-5, 2e-4))
+    drawn, taken = stage.look, 0
+
+    def look() -> dict[str, Pair]:
+        nonlocal taken
+        taken += 1
+        return dict(targets) if taken == 2 else drawn()
+
+    stage.look = look  # type: ignore[method-assign]
+    stage._moved = lambda by: (0.9 * by[0], 0.9 * by[1], 0.9 * by[2])
+    before = stage.motions
+    found = stage.drive(align(AlignmentTask(msgspec.structs.replace(calibration, confirmed=True), targets)))
+    assert found.reached
+    assert stage.motions >= before + 2
+
+
 @pytest.mark.generated(*range(20))
 def test_a_camera_that_shows_the_same_picture_again_is_told_after_one_motion(seed: int) -> None:
     stage, calibration, targets = ready(seed, noise=0.05)

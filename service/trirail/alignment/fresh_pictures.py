@@ -26,6 +26,9 @@ MAX_STALE_PICTURES = 5
 NOISE_DEVIATIONS = 4.0
 """Greatest difference of positions in the plane that is attributed to noise, in root-mean-square errors of a position.
 Noise exceeds this difference in one of 10^7 cases."""
+OLD_PICTURE_DEVIATIONS = 6.0
+"""The same for a motion: with NOISE_DEVIATIONS, noise would let one in two old pictures agree with a motion of this
+difference, and with this number, one in 400."""
 MAX_MISS_SHARE = 0.2
 """Greatest distance of a mark from its predicted position, as a fraction of the motion. A camera rotated by 5°, an
 error of the scale by 5 %, or an error of the centre of rotation by 5 mm cause a fraction of up to 0.1."""
@@ -90,7 +93,8 @@ def capture_after_motion(
     """Capture pictures after a motion until enough of them show the current pose.
 
     The capture ends when `count` pictures agree with the motion since the look `before`, or when MAX_STALE_PICTURES
-    pictures contradict the motion.
+    pictures contradict the motion. After a motion that is too small to be seen in a picture, the first
+    MAX_STALE_PICTURES - 1 pictures are not used.
 
     Parameters
     ----------
@@ -105,10 +109,16 @@ def capture_after_motion(
     """
     fresh: list[Observation] = []
     stale: list[Observation] = []
-    while len(fresh) < count and len(stale) < MAX_STALE_PICTURES:
+    (picture,) = yield from capture(1)
+    old = picture._replace(marks=before.marks)
+    if _is_explained(calibration, before, old, count, tolerance, OLD_PICTURE_DEVIATIONS):
+        # An old picture would also agree with so small a motion, and would cause the same correction again.
+        *_, picture = yield from capture(MAX_STALE_PICTURES - 1)
+    while True:
+        (fresh if _is_explained(calibration, before, picture, count, tolerance) else stale).append(picture)
+        if len(fresh) == count or len(stale) == MAX_STALE_PICTURES:
+            break
         (picture,) = yield from capture(1)
-        miss, travel = _compare(calibration, before, picture, count)
-        (fresh if miss <= MAX_MISS_SHARE * travel + tolerance else stale).append(picture)
     if len(fresh) == count:
         return PictureFit(fresh, explained=True)
     # If the pictures agree with each other, but not with the motion, the calibration is wrong: `explained` and `still`
@@ -119,6 +129,19 @@ def capture_after_motion(
     miss, travel = _compare(calibration, before, newest, count)
     is_unmoved = miss > (1.0 - MIN_TRAVEL_SHARE) * travel
     return PictureFit(stale[-count:], explained=False, still=not are_equal or is_unmoved)
+
+
+def _is_explained(
+    calibration: CameraCalibration,
+    before: Observation,
+    picture: Observation,
+    count: int,
+    tolerance: float,
+    deviations: float = NOISE_DEVIATIONS,
+) -> bool:
+    """Return True if a picture agrees with the motion since the look `before`, the mean of `count` pictures."""
+    miss, travel = _compare(calibration, before, picture, count, deviations)
+    return miss <= MAX_MISS_SHARE * travel + tolerance
 
 
 def is_consistent(
@@ -142,12 +165,16 @@ def single_picture_noise(calibration: CameraCalibration, view: str) -> float:
 
 
 def _compare(
-    calibration: CameraCalibration, before: Observation, picture: Observation, count: int
+    calibration: CameraCalibration,
+    before: Observation,
+    picture: Observation,
+    count: int,
+    deviations: float = NOISE_DEVIATIONS,
 ) -> tuple[float, float]:
     """Compare a picture with the prediction from a look and the measured motion.
 
-    Returns the greatest distance of a mark from its predicted position, minus the noise, and the longest predicted
-    travel of a mark [m].
+    Returns the greatest distance of a mark from its predicted position, minus `deviations` times the noise, and the
+    longest predicted travel of a mark [m].
     """
     miss = travel = 0.0
     for name in sorted(set(before.marks) & set(picture.marks) & set(calibration.marks)):
@@ -157,7 +184,7 @@ def _compare(
         predicted = _move_with_platform(start, before.pose, picture.pose)
         # Variance of the difference: 1 for the picture plus 1/count for the look, in each of two coordinates.
         noise = single_picture_noise(calibration, shown_by) / view.scale * math.sqrt(2.0 * (1.0 + 1.0 / count))
-        miss = max(miss, float(np.linalg.norm(observed - predicted)) - NOISE_DEVIATIONS * noise)
+        miss = max(miss, float(np.linalg.norm(observed - predicted)) - deviations * noise)
         travel = max(travel, float(np.linalg.norm(predicted - start)))
     return miss, travel
 

@@ -117,8 +117,8 @@ AlignmentProcedure = Generator[AlignmentRequest, Observation, Alignment]
 def align(task: AlignmentTask) -> AlignmentProcedure:
     """Measure and correct the misalignment of a part until one of the reasons in AlignmentEnd applies.
 
-    After a correction, success is reported only if the new look agrees with the motion. If an approach is given, the
-    platform first moves to its current pose from this offset.
+    After a correction, success is reported only if the new look agrees with the motion, and further pictures agree with
+    the new look. If an approach is given, the platform first moves to its current pose from this offset.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def align(task: AlignmentTask) -> AlignmentProcedure:
         measurements.append(measurement := _measurement(look, misalignment))
         if len(measurements) > 1:
             confirmed = confirmed or (explained and _is_as_predicted(task, measurements, corrections[-1].share))
-        end = _end_reason(task, measurements, misalignment.deviations(task.noise_share))
+        end = _end_reason(task, measurements, misalignment)
         if end is not None:
             # Pictures that do not agree with the motion may be stale. They must not lead to a report of success.
             if end is AlignmentEnd.REACHED and not explained:
@@ -180,27 +180,39 @@ def measure_part(task: AlignmentTask) -> Generator[AlignmentRequest, Observation
 def _measure_first(task: AlignmentTask) -> Generator[AlignmentRequest, Observation, tuple[Observation, Misalignment]]:
     """Return the first look and the misalignment that it shows.
 
-    Before the first look, there is no motion that could reveal a stale picture. If the look shows an aligned part, it
-    is therefore compared with further pictures. A late camera would show other positions in some of them.
+    Before the first look, there is no motion that could reveal a stale picture. The pictures of the look must therefore
+    agree with each other.
     """
-    pictures = yield from fresh_pictures.capture(task.looks)
     for _ in range(fresh_pictures.MAX_STALE_PICTURES):
+        pictures = yield from fresh_pictures.capture(task.looks)
         look = fresh_pictures.average(pictures)
         newest, tolerance = pictures[-1], 0.5 * task.tolerance
         if all(fresh_pictures.is_consistent(task.calibration, newest, each, 1, tolerance) for each in pictures):
             misalignment = yield from _measure_misalignment(task, look, "alignment")
-            # If a stale look shows an error, the correction reveals it. If it shows no error, there is no correction.
-            if not _is_within(task, misalignment):
-                return look, misalignment
-            tolerance = _miss_tolerance(task, misalignment)
-            pictures = yield from fresh_pictures.capture(max(fresh_pictures.MAX_STALE_PICTURES - 1, task.looks))
-            if all(
-                fresh_pictures.is_consistent(task.calibration, look, each, task.looks, tolerance) for each in pictures
-            ):
-                return look, misalignment
-            pictures = pictures[-task.looks :]
-        else:
-            pictures = yield from fresh_pictures.capture(task.looks)
+            return (yield from _confirm(task, look, misalignment))
+    raise (yield from _report_stale(look))
+
+
+def _confirm(
+    task: AlignmentTask, look: Observation, misalignment: Misalignment
+) -> Generator[AlignmentRequest, Observation, tuple[Observation, Misalignment]]:
+    """Return the look, or a newer look if the look shows an aligned part and further pictures contradict it.
+
+    If a stale look shows an error, the next correction reveals it. If it shows no error, only further pictures reveal
+    it: the last of them show the current pose, also if the camera is late by MAX_STALE_PICTURES - 1 pictures.
+    """
+    for _ in range(fresh_pictures.MAX_STALE_PICTURES):
+        if not _is_within(task, misalignment):
+            return look, misalignment
+        tolerance = _miss_tolerance(task, misalignment)
+        pictures = yield from fresh_pictures.capture(max(fresh_pictures.MAX_STALE_PICTURES - 1, task.looks))
+        newest = fresh_pictures.average(pictures[-task.looks :])
+        shown = yield from _measure_misalignment(task, newest, "alignment")
+        if _is_near(task, shown) and all(
+            fresh_pictures.is_consistent(task.calibration, look, each, task.looks, tolerance) for each in pictures
+        ):
+            return look, misalignment
+        look, misalignment = newest, shown
     raise (yield from _report_stale(look))
 
 
@@ -218,6 +230,8 @@ def _measure_again(
     deviation, _ = misalignment.deviations(task.noise_share)
     if fit.still and not _has_grown(task, previous.worst, misalignment.worst, deviation):
         raise (yield from _report_stale(look))
+    if fit.explained:
+        look, misalignment = yield from _confirm(task, look, misalignment)
     return look, misalignment, fit.explained
 
 
@@ -251,6 +265,15 @@ def _is_within(task: AlignmentTask, misalignment: Misalignment) -> bool:
     return misalignment.worst <= task.tolerance and abs(misalignment.motion.turn) <= task.angle
 
 
+def _is_near(task: AlignmentTask, misalignment: Misalignment) -> bool:
+    """Return True if an error exceeds the tolerance by no more than the noise of a look."""
+    place, turn = misalignment.deviations(task.noise_share)
+    return (
+        misalignment.worst <= task.tolerance + NOISE_LIMIT_DEVIATIONS * place
+        and abs(misalignment.motion.turn) <= task.angle + NOISE_LIMIT_DEVIATIONS * turn
+    )
+
+
 def _has_grown(task: AlignmentTask, before: float, now: float, deviation: float) -> bool:
     """Return True if an error has grown by more than the sum of the tolerance and the noise of both looks."""
     return now > before + task.tolerance + fresh_pictures.NOISE_DEVIATIONS * math.sqrt(2.0) * deviation
@@ -273,24 +296,17 @@ def _measurement(look: Observation, misalignment: Misalignment) -> Measurement:
 
 
 def _end_reason(
-    task: AlignmentTask, measurements: Sequence[Measurement], deviations: tuple[float, float]
+    task: AlignmentTask, measurements: Sequence[Measurement], misalignment: Misalignment
 ) -> AlignmentEnd | None:
-    """Return the reason why the alignment ends after the last measurement; None if it continues.
-
-    `deviations` are the standard deviations of `worst` [m] and `turn` [rad] in the last measurement.
-    """
-    now, (place, turn) = measurements[-1], deviations
+    """Return the reason why the alignment ends after the last measurement, of `misalignment`; None if it continues."""
+    now, (place, turn) = measurements[-1], misalignment.deviations(task.noise_share)
     is_precise = place <= task.tolerance and turn <= task.angle
-    if is_precise and now.worst <= task.tolerance and abs(now.turn) <= task.angle:
+    if is_precise and _is_within(task, misalignment):
         return AlignmentEnd.REACHED
     if len(measurements) > 1 and _has_grown(task, measurements[-2].worst, now.worst, place):
         return AlignmentEnd.GROWING
     # If the error is within the noise, a further correction is as likely to increase the error as to reduce it.
-    is_near = (
-        now.worst <= task.tolerance + NOISE_LIMIT_DEVIATIONS * place
-        and abs(now.turn) <= task.angle + NOISE_LIMIT_DEVIATIONS * turn
-    )
-    if is_near and not is_precise:
+    if _is_near(task, misalignment) and not is_precise:
         return AlignmentEnd.NOISE
     return AlignmentEnd.CORRECTIONS if len(measurements) > task.corrections else None
 
