@@ -1,19 +1,27 @@
 """Check of a log of CAN frames against CiA 301, CiA 402 and the robot's limits.
 
+    python tools/bus_log.py LOG CONFIG [--missed N]
+
+LOG is in candump's format (candump -L can0), and CONFIG is the robot's configuration. The program prints the problems,
+one line each, and exits 1 if there are any. hil.py uses the same functions.
+
 The check has its own tables of the standards, and shares no code with the driver except the layout of the frames.
 """
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import math
+import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from can import CanutilsLogReader
-from trirail.config import Config
+from trirail.config import Config, load
+from trirail.errors import TrirailError
 from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.config import Drive
 from trirail_drivers.interface import NAMES
@@ -92,9 +100,8 @@ class Setpoint(NamedTuple):
 
 def read(path: Path) -> list[Frame]:
     """Read a log in candump's format."""
-    return [
-        Frame(message.timestamp, message.arbitration_id, bytes(message.data)) for message in CanutilsLogReader(path)
-    ]
+    with CanutilsLogReader(path) as log:
+        return [Frame(message.timestamp, message.arbitration_id, bytes(message.data)) for message in log]
 
 
 def problems(log: Sequence[Frame], config: Config, missed: int, until: float) -> list[str]:
@@ -345,3 +352,27 @@ def _transition_problems(before: str, after: str, words: set[int], t: float) -> 
         asked = ASKED_BY[before, after]
         if asked is not None and not asked & words:
             yield f"from {before} to {after} at {t:.6f}, which no controlword asked for"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the problems of a log; return 1 if there are any. Exits with 2 if a file cannot be read."""
+    parser = argparse.ArgumentParser(description="Checks a log of CAN frames against CiA 301, CiA 402 and the limits.")
+    parser.add_argument("log", type=Path, help="log in candump's format: candump -L can0 > LOG")
+    parser.add_argument("config", type=Path, help="configuration of the robot")
+    parser.add_argument("--missed", type=int, default=0, help="ticks that the service missed (%(default)s)")
+    options = parser.parse_args(arguments)
+    try:
+        found = problems(read(options.log), load(options.config), options.missed, math.inf)
+    except TrirailError as error:
+        parser.error(str(error))
+    except OSError as error:
+        parser.error(f"{options.log}: {error.strerror}")
+    except (ValueError, IndexError):  # python-can has no error of its own for this
+        parser.error(f"{options.log} is not in candump's format: write it with candump -L")
+    for line in found:
+        print(line)
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

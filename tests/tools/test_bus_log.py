@@ -232,3 +232,32 @@ def test_the_frame_time_is_that_of_the_bit_rate() -> None:
     log = with_frame(layout.SDO_REQUEST + 1, layout.STATUSWORD_UPLOAD, BEFORE - 2e-4)
     assert gaps(log) == []
     assert list(bus_log.gap_problems(log, PERIOD, BusTiming(500_000), CONFIG.drives.master_node))
+
+
+def written(file: Path, log: list[Frame]) -> str:
+    lines = (f"({frame.t:.6f}) can0 {frame.identifier:03X}#{frame.data.hex().upper()}\n" for frame in log)
+    file.write_text("".join(lines), encoding="utf-8")
+    return str(file)
+
+
+def test_the_program_prints_the_problems_of_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = str(SIM.parent / "socketcan.toml")
+    assert bus_log.main([written(tmp_path / "good.log", GOOD), config]) == 0
+    assert capsys.readouterr().out == ""
+    wrong = replaced(lambda frame: frame.identifier == layout.SYNC and frame.t > 1.2, lambda frame: None)
+    wrong = [frame for frame in wrong if frame.identifier != layout.RPDO2 + 1]
+    assert bus_log.main([written(tmp_path / "wrong.log", wrong), config]) == 1
+    assert "drive A: no setpoint at all\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", [None, "no frame\n", "a b c\n", "(1.0) can0 xyz\n"])
+def test_the_program_refuses_what_is_no_log(
+    content: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bus.log"
+    if content is not None:
+        file.write_text(content, encoding="utf-8")
+    with pytest.raises(SystemExit) as ended:
+        bus_log.main([str(file), str(SIM)])
+    assert ended.value.code == 2
+    assert str(file) in capsys.readouterr().err
