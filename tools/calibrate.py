@@ -153,7 +153,10 @@ def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders
 def describe_map(fit: correction_fit.Fit) -> str:
     """Return the report on a map as text."""
     cells = math.prod(fit.correction.cells)
-    text = [f"{len(fit.before)} poses; {fit.empty} of {cells} cells have none, and get their values from neighbours"]
+    measured = f"{len(fit.before)} measurements of " if fit.distinct < len(fit.before) else ""
+    text = [
+        f"{measured}{fit.distinct} poses; {fit.empty} of {cells} cells have none, and get their values from neighbours"
+    ]
     text += ["", f"{'pose error: rms, greatest':<28}{'measured':>18}{'left':>18}{'left if not measured':>24}"]
     for k, (name, unit, scale) in enumerate(COORDINATES):
         columns = [np.abs(each[:, k]) * scale for each in (fit.before, fit.residuals, fit.predicted)]

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from trirail.kinematics.calibration import CalibrationError
 from trirail.kinematics.correction import Correction
 from trirail.kinematics.correction_fit import MIN_POSES, fit
 from trirail.kinematics.geometry import Geometry, Room
@@ -60,6 +61,48 @@ def test_what_it_foretells_is_no_less_than_what_it_leaves(seed: int) -> None:
     found = fit(PLAIN, poses + random.normal(0.0, 1e-5, poses.shape), sliders, ROOM, (4, 4, 4))
     assert (found.predicted.std(axis=0) >= 0.8e-5).all()  # of 150 poses, the noise of 1e-5 itself spreads by 6 %
     assert (found.predicted.std(axis=0) >= found.residuals.std(axis=0)).all()
+
+
+def wave(poses: Array) -> Array:
+    """Pose errors that a map of few cells cannot follow everywhere."""
+    u = (poses - LOW) / np.subtract(HIGH, LOW)
+    return np.stack(
+        [
+            5e-5 * np.sin(7.0 * u[:, 0] + 5.0 * u[:, 1]),
+            5e-5 * np.cos(6.0 * u[:, 1] + 4.0 * u[:, 2]),
+            2e-4 * np.sin(6.0 * u[:, 2] + 5.0 * u[:, 0]),
+        ],
+        axis=1,
+    )
+
+
+def test_what_is_left_at_other_poses_is_foretold_also_if_each_pose_is_measured_repeatedly() -> None:
+    said, true = [], []
+    for seed in range(3):
+        random, poses, others = np.random.default_rng(seed), reached(60, seed), reached(500, seed + 100)
+        sliders = inverse(PLAIN, poses + wave(poses)).position
+        once, repeated = (
+            fit(
+                PLAIN,
+                np.tile(poses, (rounds, 1)) + random.normal(0.0, 1e-6, (60 * rounds, 3)),
+                np.tile(sliders, (rounds, 1)),
+                ROOM,
+                (4, 4, 8),
+            )
+            for rounds in (1, 5)
+        )
+        assert once.distinct == repeated.distinct == 60
+        said.append([(found.predicted**2).mean(axis=0) for found in (once, repeated)])
+        true.append(((wave(others) - repeated.correction.at(others)) ** 2).mean(axis=0))
+    once_said, repeated_said = np.sqrt(np.mean(said, axis=0))
+    assert repeated_said == pytest.approx(once_said, rel=0.1)
+    assert (repeated_said > 0.75 * np.sqrt(np.mean(true, axis=0))).all()
+
+
+def test_repeats_of_a_pose_are_no_more_poses() -> None:
+    poses = np.repeat(reached(MIN_POSES - 1, 1), 10, axis=0)
+    with pytest.raises(CalibrationError, match=f"^{MIN_POSES - 1} poses are too few"):
+        fit(PLAIN, poses, inverse(PLAIN, poses).position, ROOM, (2, 2, 2))
 
 
 def table(path: Path, poses: Array, sliders: Array) -> Path:

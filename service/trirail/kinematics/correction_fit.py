@@ -28,7 +28,7 @@ from trirail.kinematics.robot import forward
 __all__ = ["MIN_POSES", "Fit", "fit"]
 
 MIN_POSES = 30
-"""Least number of poses: a grid with three values of x, y and phi, and a few more poses."""
+"""Least number of distinct poses: a grid with three values of x, y and phi, and a few more poses."""
 END_SHARE = 0.15
 """Fraction of the robot's range in x, y or phi that may have no measured pose at either end."""
 SAMPLES = 21
@@ -41,6 +41,8 @@ GEOMETRY_CURVATURE_WEIGHT = 2e-4
 the effects beyond the samples."""
 WEIGHTS = tuple(10.0**k for k in range(-6, 4))
 """Weights of the penalty from which cross-validation selects."""
+SAME_POSE_SHARE = 0.02
+"""Difference of two poses, as a fraction of a cell, up to which they count as measurements of the same pose."""
 FOLDS = 5
 SEED = 1
 """Seed of the random partition of the poses for cross-validation."""
@@ -56,8 +58,10 @@ class Fit(NamedTuple):
     residuals: Array
     """Pose errors that remain with the correction."""
     predicted: Array
-    """Pose errors that remain at each pose with a correction that was fitted without this pose. Similar errors can be
-    expected at poses that were not measured."""
+    """Pose errors that remain at each pose with a correction that was fitted without any measurement of this pose.
+    Similar errors can be expected at poses that were not measured."""
+    distinct: int
+    """Number of distinct poses."""
     empty: int
     """Number of cells without a measured pose. In these cells, the correction is extrapolated from neighbouring
     cells."""
@@ -71,9 +75,11 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
     pose.
     """
     low, high = room.low, room.high
-    if len(poses) < MIN_POSES:
+    group = _distinct(poses, SAME_POSE_SHARE * np.subtract(high, low) / cells)
+    distinct = int(group.max(initial=-1)) + 1
+    if distinct < MIN_POSES:
         raise CalibrationError(
-            f"{len(poses)} poses are too few for a map: at least {MIN_POSES} are required, "
+            f"{distinct} poses are too few for a map: at least {MIN_POSES} are required, "
             "and about a hundred are recommended"
         )
     reached = _reached(geometry, room)
@@ -96,7 +102,8 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
     shape = [n + DEGREE for n in cells]
     rows, at = splines(poses, low, high, cells)
     curvature = _curvature(shape)
-    fold = np.random.default_rng(SEED).permutation(len(poses)) % FOLDS
+    # All measurements of a pose are in the same fold. Otherwise, the others would predict the one that is left out.
+    fold = (np.random.default_rng(SEED).permutation(distinct) % FOLDS)[group]
     scale = np.maximum(wanted.std(axis=0), 1e-12)
     by_geometry = _by_geometry(geometry, room, cells, curvature)
 
@@ -117,8 +124,20 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
         before=-wanted,
         residuals=wanted - rows @ solution,
         predicted=trials[best],
+        distinct=distinct,
         empty=math.prod(cells) - len(np.unique(at, axis=0)),
     )
+
+
+def _distinct(poses: Array, size: Array) -> NDArray[np.int64]:
+    """Return the number of the distinct pose of each pose, (N,). Poses within `size`, (3,), of its first are equal."""
+    group: NDArray[np.int64] = np.full(len(poses), -1)
+    number = 0
+    for row, pose in enumerate(poses):
+        if group[row] < 0:
+            group[(group < 0) & (np.abs(poses - pose) <= size).all(axis=1)] = number
+            number += 1
+    return group
 
 
 def _reached(geometry: Geometry, room: Room, beyond: float = 0.0) -> Array:
