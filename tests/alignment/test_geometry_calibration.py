@@ -221,6 +221,8 @@ def test_planned_poses_tell_more_than_random_ones_and_keep_marks_in_the_pictures
     model, unknowns, noise = start_model(task, first)
     planned = plan(task, model, unknowns, first, noise)
     assert len(planned) == 23
+    assert len({look.pose for look in planned}) == 23
+    assert len({look.pose for look in plan(task._replace(poses=60), model, unknowns, first, noise)}) == 53
     assert all(set(look.marks) == set(found.looks[7 + n].marks) == set(PART) for n, look in enumerate(planned))
     poses = unseen(task, 200)
     sliders = inverse(task.start, poses).position

@@ -10,6 +10,7 @@ the whole travel. The selection is greedy: the next pose is always the candidate
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -81,7 +82,11 @@ def choose_poses(
     count: int,
     noise: float,
 ) -> list[StageLook]:
-    """Select `count` candidates one after the other. Each lowers the mean variance over all candidates most."""
+    """Select `count` candidates one after the other. Each lowers the mean variance over all candidates most.
+
+    No candidate is selected again before all have been: looks at one pose tell nothing about errors at other poses, and
+    would predict each other when looks are held out of the fit.
+    """
     every = np.concatenate([each.jacobian for each in candidates])
     scales = np.maximum(np.linalg.norm(every, axis=0), 1e-300)
     jacobians = [each.jacobian / scales / noise for each in candidates]
@@ -92,15 +97,19 @@ def choose_poses(
         J = model.jacobian(unknowns, earlier).reshape(-1, model.size) / scales / noise
         A += J.T @ J
     covariance = np.linalg.inv(A)
-    chosen = []
+    chosen: list[StageLook] = []
+    left: set[int] = set()
     for _ in range(count):
-        best, most = 0, -1.0
+        left = left or set(range(len(candidates)))
+        best, most = -1, -math.inf
         spread = covariance @ Q @ covariance
-        for number, J in enumerate(jacobians):
+        for number in sorted(left):
+            J = jacobians[number]
             core = np.eye(len(J)) + J @ covariance @ J.T
             gain = float(np.trace(np.linalg.solve(core, J @ spread @ J.T)))
             if gain > most:
                 best, most = number, gain
+        left.remove(best)
         chosen.append(candidates[best].look)
         J = jacobians[best]
         P = covariance @ J.T
