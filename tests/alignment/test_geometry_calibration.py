@@ -15,13 +15,14 @@ from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.geometry_calibration import (
     GeometryCalibration,
     GeometryTask,
+    _Scatter,
     calibrate_geometry,
     plan,
     start_model,
 )
 from trirail.alignment.images import Lens, Pair, project_points
 from trirail.alignment.pose_plan import choose_poses, find_candidates
-from trirail.alignment.procedure import AlignmentTask, StageMotion, align, repeat_calibration
+from trirail.alignment.procedure import AlignmentTask, Observation, StageMotion, align, repeat_calibration
 from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.stage_model import StageLook, StageModel
 from trirail.client.stage_as_built import built_otherwise
@@ -238,6 +239,24 @@ def test_planned_poses_tell_more_than_random_ones_and_keep_marks_in_the_pictures
 
     assert variance(planned) < 0.8 * variance(random)
     assert choose_poses(model, unknowns, first, candidates, 0, noise) == []
+
+
+@pytest.mark.parametrize("looks", [2, 3, 4, 8])
+def test_the_noise_of_pictures_at_rest_is_that_which_there_is(looks: int) -> None:
+    """In each camera its own; a mark that is missing in a picture, or mistaken for another, does not matter."""
+    rng, scatter, noises = np.random.default_rng(looks), _Scatter(), {"left": 0.05, "right": 0.2}
+    for number in range(3000):
+        pictures = []
+        for picture in range(looks):
+            seen = {name: (float(u), float(v)) for name, (u, v) in zip(noises, rng.normal(size=(2, 2)), strict=True)}
+            marks = {name: (noises[name] * u, noises[name] * v) for name, (u, v) in seen.items()}
+            if number % 3 == 1 and picture == 0:
+                del marks["left"]
+            if number % 50 == 2 and picture == 0:
+                marks["right"] = (300.0, 200.0)
+            pictures.append(Observation(marks, (0.0, 0.0, 0.0), 0.0))
+        scatter.add(pictures)
+    assert scatter.noise == pytest.approx(math.sqrt((0.05**2 + 0.2**2) / 2.0 / looks), rel=0.05)
 
 
 def test_a_map_is_offered_for_errors_that_no_geometry_explains_where_it_helps_at_looks_that_it_does_not_know() -> None:

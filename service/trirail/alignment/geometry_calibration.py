@@ -189,7 +189,7 @@ class _Scatter:
     """Estimator of the noise of marks, from the differences between the pictures of each look."""
 
     def __init__(self) -> None:
-        self._squares: list[float] = []
+        self._variances: dict[str, list[float]] = {}
         self._pictures = 1
 
     def add(self, pictures: Sequence[Observation]) -> None:
@@ -198,12 +198,23 @@ class _Scatter:
         for name in {name for each in pictures for name in each.marks}:
             seen = np.array([each.marks[name] for each in pictures if name in each.marks])
             if len(seen) > 1:
-                self._squares.append(float(seen.var(axis=0, ddof=1).mean()))
+                variance = float(seen.var(axis=0, ddof=1).mean())
+                self._variances.setdefault(name, []).append(variance / _median_share(2 * (len(seen) - 1)))
 
     @property
     def noise(self) -> float:
         """Standard deviation of the u or v of a mark in a look [pixel]; 0 if each look consists of one picture."""
-        return math.sqrt(float(np.median(self._squares)) / self._pictures) if self._squares else 0.0
+        # A mistaken mark in some pictures does not change a median. The cameras of the marks may differ in noise.
+        medians = [np.median(variances) for variances in self._variances.values()]
+        return math.sqrt(float(np.mean(medians)) / self._pictures) if medians else 0.0
+
+
+def _median_share(freedom: int) -> float:
+    """Return the median of a sample variance, divided by its mean, for normal noise and given degrees of freedom."""
+    from scipy.special import gammaincinv  # type: ignore[import-untyped]
+
+    # The variance has the chi-squared distribution, which is a gamma distribution: the median for freedom 2 is log 2.
+    return float(gammaincinv(freedom / 2.0, 0.5) / (freedom / 2.0))
 
 
 def _observe(task: GeometryTask, scatter: _Scatter) -> Generator[AlignmentRequest, Observation, Observation]:
