@@ -33,7 +33,9 @@ class ViewChange(msgspec.Struct, frozen=True):
     scale: float
     """Relative change of the scale."""
     deviation: float
-    """Standard deviation of `turn` [rad], which is also the standard deviation of `scale`."""
+    """Standard deviation of `turn` [rad]."""
+    scale_deviation: float
+    """Standard deviation of `scale`."""
 
     @property
     def is_shifted(self) -> bool:
@@ -46,7 +48,11 @@ class ViewChange(msgspec.Struct, frozen=True):
     @property
     def is_changed(self) -> bool:
         """True if the shift, the rotation or the change of scale of the view is significant."""
-        return self.is_shifted or max(abs(self.turn), abs(self.scale)) > SIGNIFICANT_DEVIATIONS * self.deviation
+        return (
+            self.is_shifted
+            or abs(self.turn) > SIGNIFICANT_DEVIATIONS * self.deviation
+            or abs(self.scale) > SIGNIFICANT_DEVIATIONS * self.scale_deviation
+        )
 
 
 def compare_views(saved: CameraCalibration, current: CameraCalibration) -> list[ViewChange]:
@@ -66,22 +72,27 @@ def _compare_view(saved: CameraCalibration, current: CameraCalibration, view: st
     deviation = np.hypot(_place_deviations(saved, view), _place_deviations(current, view))
     # Apart from mirroring and skew, each map corresponds to a complex number. The argument of the ratio of both numbers
     # is the rotation, and the absolute value is the scale.
-    ratio = np.array(after.matrix) @ np.linalg.inv(_matrix_at(before, after.origin))
-    rotation = complex(ratio[0, 0] + ratio[1, 1], ratio[1, 0] - ratio[0, 1]) / 2.0
-    map_deviation = math.hypot(*(_map_deviation(each, view, after.origin) for each in (saved, current)))
+    rotation = _as_number(_matrix_at(after, after.origin) @ np.linalg.inv(_matrix_at(before, after.origin)))
+    turn, scale = np.hypot(*(_map_deviations(each, view, after.origin) for each in (saved, current))).tolist()
     return ViewChange(
         view,
         (float(shift[0]), float(shift[1])),
         (float(deviation[0]), float(deviation[1])),
         math.atan2(rotation.imag, rotation.real),
         abs(rotation) - 1.0,
-        map_deviation,
+        turn,
+        abs(rotation) * scale,
     )
 
 
 def _place_deviations(calibration: CameraCalibration, view: str) -> Floats:
     """Return the greatest standard deviations of the positions of the marks in a view, in x and y, (2,) [m]."""
     return np.asarray(np.max([mark.deviation for mark in calibration.marks.values() if mark.view == view], axis=0))
+
+
+def _as_number(matrix: Floats) -> complex:
+    """Return the complex number with the rotation and the scale of a matrix (2, 2)."""
+    return complex(matrix[0, 0] + matrix[1, 1], matrix[1, 0] - matrix[0, 1]) / 2.0
 
 
 def _matrix_at(view: CameraView, origin: Pair) -> Floats:
@@ -91,16 +102,32 @@ def _matrix_at(view: CameraView, origin: Pair) -> Floats:
     return np.asarray(projection_jacobians(view, np.array([origin]))[0])
 
 
-def _map_deviation(calibration: CameraCalibration, view: str, origin: Pair) -> float:
-    """Return the standard deviation of the rotation of a view [rad], which equals that of the relative scale.
+def _map_deviations(calibration: CameraCalibration, view: str, origin: Pair) -> tuple[float, float]:
+    """Return the standard deviations of the rotation of a view [rad] and of its relative scale.
 
-    In perspective, both also depend on g if the point o is another one. The deviation of the scale is then greater by
-    1.5 times the distance of the points times the deviation of g.
+    A change dM of the matrix rotates and scales the picture by the complex number of dM M^-1. Its real and imaginary
+    parts are linear in the unknowns of the map, whose covariance is known.
     """
-    # Entries 2 to 5 of the unknowns are the elements of M, row by row; in perspective, entries 6 and 7 are g.
-    variances = np.diag(np.array(calibration.covariances[view]))
     own = calibration.views[view]
-    deviation = float(np.sqrt(variances[2:6].sum() / 2.0)) / own.scale / math.sqrt(2.0)
-    if own.lens != "perspective":
-        return deviation
-    return math.hypot(deviation, 1.5 * math.dist(origin, own.origin) * math.sqrt(variances[6:8].max()))
+    # Entries 2 to 5 of the unknowns are the elements of M, row by row; in perspective, entries 6 and 7 are g.
+    used = slice(2, 8 if own.lens == "perspective" else 6)
+    inverse = np.linalg.inv(_matrix_at(own, origin))
+    changes = np.array([_as_number(each @ inverse) for each in _matrix_derivatives(own, origin)])
+    covariance = np.array(calibration.covariances[view])[used, used]
+    turn, scale = (math.sqrt(max(each @ covariance @ each, 0.0)) for each in (changes.imag, changes.real))
+    return turn, scale
+
+
+def _matrix_derivatives(view: CameraView, origin: Pair) -> list[Floats]:
+    """Return the derivatives of _matrix_at with respect to the elements of M and, in perspective, of g."""
+    units = np.eye(4).reshape(4, 2, 2)
+    if view.lens != "perspective":
+        return [*units]
+    # The matrix at the distance d from o is M (1 - d g' / w) / w, with w = 1 + g' d.
+    d, g = np.subtract(origin, view.origin), np.array(view.bend)
+    w, matrix = 1.0 + g @ d, np.array(view.matrix)
+    by_g = [
+        -matrix @ (d[axis] * (np.eye(2) - 2.0 * np.outer(d, g) / w) + np.outer(d, np.eye(2)[axis])) / w**2
+        for axis in range(2)
+    ]
+    return [*(each @ (np.eye(2) - np.outer(d, g) / w) / w for each in units), *by_g]

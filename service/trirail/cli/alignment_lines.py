@@ -108,8 +108,8 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
         verdict = "[red]was moved: calibrate again[/]" if each.is_changed else "as it was"
         terminal.out.print(
             f"view {terminal.plain(each.view)}: {verdict}; shifted by x {x * 1e6:.0f} ± {dx * 1e6:.0f} µm, "
-            f"y {y * 1e6:.0f} ± {dy * 1e6:.0f} µm, turned by {each.turn * 1e3:.2f} mrad, "
-            f"scale {each.scale * 1e6:+.0f} ppm, both ± {each.deviation * 1e6:.0f} ppm",
+            f"y {y * 1e6:.0f} ± {dy * 1e6:.0f} µm, turned by {each.turn * 1e3:.2f} ± "
+            f"{each.deviation * 1e3:.2f} mrad, scale {each.scale * 1e6:+.0f} ± {each.scale_deviation * 1e6:.0f} ppm",
             soft_wrap=True,
         )
 
