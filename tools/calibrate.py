@@ -100,10 +100,17 @@ def describe(result: Calibration, lines: Sequence[int]) -> str:
             known = f"{error * 1e3:.4f}" if math.isfinite(error) else "open"
             text.append(f"{f'{leg} {name} [{unit}]':<36}{change * 1e3:>10.4f}{known:>12}")
 
+    if result.misfit > 1.0:
+        text.append(f"The standard errors follow from {result.misfit:.2f} times the stated noise, as the residuals do.")
+
     text += ["", HELD]
     for leg, names, combinations in result.open:
+        label = result.geometry.labels[LEGS.index(leg)]
+        if len(names) == 1:
+            text.append(f"{label}: these poses do not determine {names[0]}: it stays as in the starting geometry.")
+            continue
         what = "one combination of them stays" if combinations == 1 else f"{combinations} combinations of them stay"
-        text.append(f"Leg {leg}: these poses cannot separate {', '.join(names)}: {what} as in the starting geometry.")
+        text.append(f"{label}: these poses cannot separate {', '.join(names)}: {what} as in the starting geometry.")
     if result.open:
         text.append("Poses that differ more, in phi above all, would.")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from pathlib import Path
@@ -15,7 +16,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from trirail import config
 from trirail.kinematics import calibration
-from trirail.kinematics.calibration import CalibrationError, corrected, identify, pose_derivatives
+from trirail.kinematics.calibration import CalibrationError, Open, corrected, identify, pose_derivatives
 from trirail.kinematics.geometry import LEGS, Geometry, Leg
 from trirail.kinematics.robot import forward, inverse
 
@@ -108,13 +109,25 @@ def test_standard_errors_are_those_of_many_trials() -> None:
     assert np.mean([found.misfit**2 for found in trials]) == pytest.approx(1.0, abs=0.1)
 
 
+def test_standard_errors_are_those_of_many_trials_also_if_the_stated_noise_is_too_low() -> None:
+    random = np.random.default_rng(1)
+    true = DOUBT * 0.2 * random.standard_normal((3, 5))
+    seen = poses(random, 30)
+    sliders = inverse(corrected(START, true), seen).position
+    trials = [identify(START, seen + 2.5 * (noisy(random, seen) - seen), sliders) for _ in range(60)]
+    errors = np.array([found.corrections - true for found in trials])
+    said = np.array([found.standard_errors for found in trials])
+    assert np.mean((errors / said) ** 2) == pytest.approx(1.0, abs=0.2)
+    assert calibrate.describe(trials[0], range(30)).count(f"{trials[0].misfit:.2f} times the stated noise") == 2
+
+
 def test_stated_noise_weighs_and_scales() -> None:
     random = np.random.default_rng(2)
     robot, seen = as_built(random), poses(random, 60)
     seen_noisily, sliders = noisy(random, seen), inverse(robot, seen).position
     once = identify(START, seen_noisily, sliders)
     double = identify(START, seen_noisily, sliders, position_noise=40e-6, angle_noise=2e-4)
-    assert_allclose(double.standard_errors, 2.0 * once.standard_errors, rtol=1e-4)
+    assert_allclose(double.standard_errors, 2.0 * once.standard_errors / max(1.0, once.misfit), rtol=1e-4)
     assert double.misfit == pytest.approx(once.misfit / 2.0)
     by_position = identify(START, seen_noisily, sliders, angle_noise=1.0)
     assert np.std(by_position.residuals[:, 0]) < np.std(once.residuals[:, 0])
@@ -359,9 +372,20 @@ def test_what_is_open_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     said = capsys.readouterr().err
     names = "anchor across the rail, home, edge_point across the edge"
     for leg in LEGS:
-        assert f"Leg {leg}: these poses cannot separate {names}: 2 combinations of them stay" in said
+        assert f"{leg}: these poses cannot separate {names}: 2 combinations of them stay" in said
     assert re.search(r"A home \[mm\] .* open\n", said)
     assert "in phi above all" in said
+
+
+def test_a_leg_has_its_label_everywhere_and_one_parameter_is_no_combination() -> None:
+    random = np.random.default_rng(17)
+    start, seen = dataclasses.replace(START, labels=("U", "V", "W")), poses(random, 30)
+    found = identify(start, seen, inverse(START, seen).position)
+    open_parameters = (Open("A", (HOME,), 1), Open("C", (HOME, EDGE_POINT), 1))
+    said = calibrate.describe(found._replace(open=open_parameters), range(30))
+    assert f"\nU: these poses do not determine {HOME}: it stays as in the starting geometry." in said
+    assert f"\nW: these poses cannot separate {HOME}, {EDGE_POINT}: one combination of them stays" in said
+    assert "Leg" not in said
 
 
 HEADER = "x,y,phi,A,B,C\n"

@@ -59,7 +59,8 @@ class Calibration(NamedTuple):
 
     geometry: Geometry
     corrections: Array  # (3, 5), relative to the starting geometry [m, rad]
-    standard_errors: Array  # (3, 5), from the stated noise; infinite for undetermined parameters
+    # (3, 5), from the stated noise times max(1, misfit); infinite for undetermined parameters
+    standard_errors: Array
     open: tuple[Open, ...]
     residuals: Array  # (N, 3): measured minus computed x, y, phi [m, m, rad]
     misfit: float  # root mean square of residual divided by noise, per degree of freedom; about 1 for good data
@@ -123,7 +124,8 @@ def identify(
             "phi"
         )
     deviations = (basis @ np.linalg.pinv(solution.jac)).reshape(3, 5, -1)
-    errors = np.sqrt(np.sum(deviations**2, axis=2))
+    # Residuals above the stated noise show that the noise was stated too low. Residuals below it may be chance.
+    errors = max(1.0, misfit) * np.sqrt(np.sum(deviations**2, axis=2))
     for leg, names, _ in unknown:
         errors[LEGS.index(leg), [start.parameters.index(name) for name in names]] = math.inf
     return Calibration(
