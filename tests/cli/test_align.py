@@ -24,6 +24,7 @@ from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.cli import mark_source
 from trirail.cli.app import app
 from trirail.cli.mark_source import MarkSource
+from trirail.client import calibration_file
 from trirail.client.client import Robot
 from trirail.config import SIM
 from trirail.errors import TrirailError
@@ -359,3 +360,24 @@ def test_one_source_of_marks_is_wanted(given: tuple[str, ...], tmp_path: Path) -
 def test_a_folder_that_is_not_there_is_known_before_the_stage_moves(words: tuple[object, ...], missing: str) -> None:
     with pytest.raises(TrirailError, match=f"{missing}: there is no folder absent"):
         app(["align", *map(str, words), "--program", "true"])
+
+
+@pytest.mark.parametrize("out", [False, True])
+def test_cameras_of_a_geometry_are_written_beside_its_configuration(
+    out: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not to the working directory, where another stage's calibration may lie."""
+    config = tmp_path / "stage" / "robot.toml"
+    for folder in ("stage", "new"):
+        (tmp_path / folder).mkdir()
+    config.write_text(SIM.read_text(encoding="utf-8"), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+
+    def refuse(path: Path) -> None:
+        raise TrirailError(f"cameras in {path}")
+
+    monkeypatch.setattr(calibration_file, "check_folder", refuse)
+    words = ["--out", str(tmp_path / "new" / "new.toml")] if out else []
+    expected = tmp_path / ("new" if out else "stage") / "camera.json"
+    with pytest.raises(TrirailError, match=f"^cameras in {expected}$"):
+        app(["align", "geometry", str(config), "--field", "9", "9", "--program", "true", *words])

@@ -73,7 +73,8 @@ def _compare_view(saved: CameraCalibration, current: CameraCalibration, view: st
     # Apart from mirroring and skew, each map corresponds to a complex number. The argument of the ratio of both numbers
     # is the rotation, and the absolute value is the scale.
     rotation = _as_number(_matrix_at(after, after.origin) @ np.linalg.inv(_matrix_at(before, after.origin)))
-    turn, scale = np.hypot(*(_map_deviations(each, view, after.origin) for each in (saved, current))).tolist()
+    deviations = [_map_deviations(each, view, after.origin) for each in (saved, current)]
+    turn, scale = (math.hypot(*each) for each in zip(*deviations, strict=True))
     return ViewChange(
         view,
         (float(shift[0]), float(shift[1])),

@@ -39,7 +39,7 @@ def geometry(
     *,
     field: Annotated[tuple[int, int], Parameter(negative="")],
     out: Path | None = None,
-    calibration: Path = Path("camera.json"),
+    calibration: Path | None = None,
     poses: int = 30,
     one_camera: Annotated[bool, Flag] = False,
     lens: Literal["affine", "perspective", "radial"] = "radial",
@@ -62,7 +62,8 @@ def geometry(
     out
         Configuration to write. If absent, it gets an unused name beside CONFIG.
     calibration
-        Camera calibration to write, for `trirail align run`; an existing file is saved as FILE.old.
+        Camera calibration to write, for `trirail align run`; an existing file is saved as FILE.old. If absent, it is
+        camera.json beside the new configuration.
     poses
         Number of looks to take, 12 or more.
     one_camera
@@ -84,6 +85,7 @@ def geometry(
     settings = load(config)
     if out is not None:
         config_edit.check_new_file(out)
+    calibration = calibration or (out or config).with_name("camera.json")
     calibration_file.check_folder(calibration)
     way = approach[0], approach[1], notation.radians(approach[2], False)
     with source.open_source() as (look, known), service.open() as robot:
