@@ -172,7 +172,7 @@ def test_a_dataframe_is_the_table_by_time(recording: Recording) -> None:
     assert list(frame.columns) == ["pose_x", "pose_y", "pose_phi", "mode"]
     np.testing.assert_array_equal(frame["pose_x"], recording.records["pose"][::10, 0])
     assert frame.index.tolist() == recording.t[::10].tolist()
-    assert len(recording.table(0.01)) == len(frame)
+    assert len(recording.table(0.01)) == len(recording.table("0.01")) == len(frame)
     for nonsense in ("10 parsec", "", "-5ms", "0s"):
         with pytest.raises(ServiceError):
             recording.table(nonsense)

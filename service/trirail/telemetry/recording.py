@@ -18,6 +18,7 @@ from trirail.wire.looks import AlignmentLook
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.records import DTYPE, PART_NAMES
 from trirail.wire.text import quoted
+from trirail.wire.units import TIME, quantity
 from trirail.wire.vocabulary import MODES
 
 if TYPE_CHECKING:
@@ -164,7 +165,7 @@ class Recording(NamedTuple):
         Parameters
         ----------
         every
-            Interval of the rows, in seconds or as text such as "10ms"; None for all rows.
+            Interval of the rows, in seconds or as text such as "10ms" or "0.01"; None for all rows.
         columns
             Names of fields, or words that occur in names, such as pose or error; all fields if empty. Columns of poses
             end in _x, _y, _phi, and columns of sliders end in _a, _b, _c.
@@ -175,16 +176,15 @@ class Recording(NamedTuple):
             A column is unknown, or pandas is not installed.
         """
         try:
-            import pandas as pd
+            import pandas as pd  # noqa: F401 - to_pandas needs it
         except ImportError as error:
             raise ServiceError("a DataFrame needs pandas: pip install 'trirail[analysis]'") from error
         recording = self
         if every is not None:
             try:
-                seconds = pd.Timedelta(every).total_seconds() if isinstance(every, str) else every
+                seconds = quantity(every, TIME) if isinstance(every, str) else every
             except ValueError as error:
-                words = f"the interval of the rows, {quoted(str(every))}, is not a time: use a time such as 10ms"
-                raise ServiceError(words) from error
+                raise ServiceError(f"the interval of the rows: {error}") from error
             recording = self.part(every=seconds)
         made: pd.DataFrame = table(recording, columns).to_pandas().set_index("t")
         return made
