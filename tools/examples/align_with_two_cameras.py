@@ -18,6 +18,7 @@ VIEWS = {
 
 with Robot(*sys.argv[1:]) as robot:
     robot.enable()
+    robot.move_to(x=0.0, y=0.0, phi=0.0).wait()  # where the marks are in the pictures
     rng = np.random.default_rng()
     part = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
 
