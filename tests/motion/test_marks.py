@@ -160,6 +160,21 @@ def test_marks_that_the_path_does_not_pass_are_refused(mark: Mark, words: str) -
     assert words in str(refused.value)
 
 
+@pytest.mark.parametrize("kind", ROBOTS)
+@pytest.mark.generated(*range(10))
+def test_a_path_that_begins_at_zero_is_said_to_begin_there(kind: str, seed: int) -> None:
+    """The pose of a robot that has come back to x = 0 follows from its sliders, and is wrong in the last digits."""
+    rng = np.random.default_rng(seed)
+    begin, target = (rng.uniform(-1.0, 1.0, 3) * (0.004, 0.004, 0.02) for _ in range(2))
+    begin[0], target[0] = rng.choice([-1e-18, 1e-18]), abs(target[0])
+    config = ROBOTS[kind]
+    planner = GoalPlanner(corrected_geometry(config), config.limits, config.period)
+    run = planner.plan(PoseGoal(*target.tolist()), Schedule(rest(begin), config.period), 1.0, 3).run
+    with pytest.raises(RefusedError) as refused:
+        placed(kind, run, Mark("valve", at=Crossing(x=-0.01)))
+    assert "the path goes from 0 to " in str(refused.value)
+
+
 def test_a_path_on_which_the_tool_only_turns_has_no_share_of_its_length() -> None:
     run = planned("3-PRP", PoseGoal(0.0, 0.0, 0.2))
     with pytest.raises(RefusedError, match="the tool does not travel"):

@@ -258,7 +258,7 @@ def _time_of(number: int, mark: Mark, trace: _Trace) -> float:
         coordinate, value = mark.at.coordinate
         s = trace.crossing(coordinate, value)
         if s is None:
-            here = trace.coordinates[:, coordinate]
+            here = np.round(trace.coordinates[:, coordinate], 9) + 0.0  # [nm]; 0.0 turns -0 into 0
             name = ("x", "y", "phi")[coordinate]
             scale, unit = (1e3, "mm") if coordinate < 2 else (1.0, "rad")
             text = (
