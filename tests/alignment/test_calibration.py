@@ -8,7 +8,13 @@ import pytest
 from alignment.cameras import Stage, camera
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, calibrate, to_base_frame
+from trirail.alignment.camera_calibration import (
+    CalibrationSample,
+    CameraCalibration,
+    calibrate,
+    check_moves,
+    to_base_frame,
+)
 from trirail.alignment.images import LENSES, Lens, locate_pixels, project_points, projection_jacobians
 from trirail.alignment.misalignment import measure_misalignment
 from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves, calibration_moves
@@ -165,9 +171,31 @@ def test_marks_that_stand_still_are_refused() -> None:
     ids=["too few", "along x", "along a line", "turns alone", "no turn"],
 )
 def test_moves_that_do_not_tell_it_are_refused(moves: list[Triple]) -> None:
+    stage = two_cameras(4)
     with pytest.raises(AlignmentError) as refused:
-        two_cameras(4).drive(calibrate_by_moves(moves))
+        stage.drive(calibrate_by_moves(moves))
     assert refused.value.fault is AlignmentFault.MOVES
+    assert stage.motions == 0
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(SEEDS, st.floats(5e-4, 1e-2), st.floats(3e-3, 0.05), st.booleans())
+def test_moves_that_tell_it_are_not_refused_before_they_are_made(
+    lens: Lens, seed: int, by: float, turn: float, one: bool
+) -> None:
+    """At any place on the table; for a single picture of both marks, and for two."""
+    x, y, phi = np.random.default_rng(seed).uniform(-0.05, 0.05, 3).tolist()
+    poses = [(x + a, y + b, phi + c) for a, b, c in ((0.0, 0.0, 0.0), *calibration_moves(lens, by, turn))]
+    check_moves(poses, ["left", "right"], dict.fromkeys(PART, "camera") if one else None, lens)
+
+
+def test_a_first_look_without_a_mark_is_refused_and_nothing_moves() -> None:
+    stage = two_cameras(4)
+    stage.look = dict  # type: ignore[method-assign]
+    with pytest.raises(AlignmentError, match="first look") as refused:
+        stage.drive(calibrate_by_moves())
+    assert refused.value.fault is AlignmentFault.MISSING
+    assert stage.motions == 0
 
 
 def test_a_lens_that_so_few_looks_cannot_tell_is_refused() -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from alignment.cameras import FOCUS, part_at
 from processes.test_service import told, until
+from trirail.alignment.calibration_procedure import DEFAULT_MOVES
 from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.images import CameraView, Pair, project_points
 from trirail.client import calibration_file
@@ -146,7 +147,9 @@ def test_ctrl_c_in_a_motion_stops_the_robot(locator: str) -> None:
         thread = threading.Thread(target=interrupt)
         thread.start()
         with pytest.raises(KeyboardInterrupt):
-            robot.calibrate_camera(lambda: seen(PART, robot.state().pose), [(0.05, 0.0, 0.0)], speed=0.02)
+            robot.calibrate_camera(
+                lambda: seen(PART, robot.state().pose), [(0.05, 0.0, 0.0), *DEFAULT_MOVES], speed=0.02
+            )
         thread.join()
         assert until(robot, lambda state: state.mode == Mode.HOLDING).pose[0] < 0.045
         told(robot, lambda heard: ended(heard[-1]) == ("failed", "KeyboardInterrupt"))

@@ -13,7 +13,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.alignment import arguments
 from trirail.alignment.alignment_request import AlignmentRequest, LookReport, Observation, StageMotion
-from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, calibrate
+from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, calibrate, check_moves
 from trirail.alignment.fresh_pictures import observe_mean
 from trirail.alignment.images import Lens, Pair
 from trirail.errors import AlignmentError, AlignmentFault
@@ -69,13 +69,14 @@ def calibrate_by_moves(
     first = yield from observe_mean(looks)
     observations = [first]
     yield LookReport("calibration", first)
-    # The names of the marks are known after the first look. Check them before any move.
-    if views is not None and (unknown := sorted(set(first.marks) - set(views))):
-        text = f"marks without a view: {', '.join(unknown)}; give each mark a view; views has {', '.join(views)}"
-        yield LookReport("calibration", end=AlignmentFault.MISSING, words=text)
-        raise AlignmentError(AlignmentFault.MISSING, text)
-    for move in moves:
-        yield StageMotion(_add(first.pose, move), approach=approach)
+    poses = [_add(first.pose, move) for move in moves]
+    try:
+        _check_first(first, poses, views, lens)
+    except AlignmentError as error:
+        yield LookReport("calibration", end=error.fault, words=str(error))
+        raise
+    for pose in poses:
+        yield StageMotion(pose, approach=approach)
         observations.append((yield from observe_mean(looks)))
         yield LookReport("calibration", observations[-1])
     yield StageMotion(first.pose, approach=approach)
@@ -87,6 +88,21 @@ def calibrate_by_moves(
         raise
     yield LookReport("calibration", end="calibrated", noise=calibration.noise)
     return calibration
+
+
+def _check_first(first: Observation, poses: Sequence[Triple], views: Mapping[str, str] | None, lens: Lens) -> None:
+    """Check before any move that the first look shows marks with a view, and that the moves determine the maps.
+
+    Raises AlignmentError.
+    """
+    if not first.marks:
+        raise AlignmentError(
+            AlignmentFault.MISSING, "no mark was found in the first look; check light, focus and threshold"
+        )
+    if views is not None and (unknown := sorted(set(first.marks) - set(views))):
+        text = f"marks without a view: {', '.join(unknown)}; give each mark a view; views has {', '.join(views)}"
+        raise AlignmentError(AlignmentFault.MISSING, text)
+    check_moves([first.pose, *poses], sorted(first.marks), views, lens)
 
 
 def repeat_calibration(

@@ -232,6 +232,22 @@ def fit_cameras(
     return separate_noises(CameraCalibration(fitted, marks, noise, residuals, poses, covariances, looks=looks))
 
 
+def check_moves(poses: Sequence[Triple], marks: Sequence[str], views: Mapping[str, str] | None, lens: Lens) -> None:
+    """Check that looks at poses [m, rad] determine the maps, if every look shows all marks without noise.
+
+    Raises AlignmentError if they do not.
+    """
+    # An ideal camera above each mark needs no more looks than any other. At this scale, no move is too short for it.
+    place = (0.05, 0.0)
+    x, y = to_base_frame(place, poses[0]).tolist()
+    ideal = CameraView((x, y), (0.0, 0.0), ((1e9, 0.0), (0.0, 1e9)), lens)
+    pixels = project_points(ideal, np.array([to_base_frame(place, pose) for pose in poses]))
+    samples = [
+        CalibrationSample(pose, dict.fromkeys(marks, _pair(pixel))) for pose, pixel in zip(poses, pixels, strict=True)
+    ]
+    fit_cameras(samples, views, lens)
+
+
 def separate_noises(common: CameraCalibration) -> CameraCalibration:
     """Return a calibration with the noise of each view, and with its covariances and deviations scaled to this noise.
 
