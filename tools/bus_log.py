@@ -362,16 +362,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--missed", type=int, default=0, help="ticks that the service missed (%(default)s)")
     options = parser.parse_args(arguments)
     try:
-        found = problems(read(options.log), load(options.config), options.missed, math.inf)
+        lines = problems(read(options.log), load(options.config), options.missed, math.inf)
     except TrirailError as error:
         parser.error(str(error))
     except OSError as error:
         parser.error(f"{options.log}: {error.strerror}")
     except (ValueError, IndexError):  # python-can has no error of its own for this
         parser.error(f"{options.log} is not in candump's format: write it with candump -L")
-    for line in found:
+    for line in lines:
         print(line)
-    return 1 if found else 0
+    return 1 if lines else 0
 
 
 if __name__ == "__main__":
