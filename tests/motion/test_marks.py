@@ -169,7 +169,7 @@ def test_a_path_that_begins_at_zero_is_said_to_begin_there(kind: str, seed: int)
     begin[0], target[0] = rng.choice([-1e-18, 1e-18]), abs(target[0])
     config = ROBOTS[kind]
     planner = GoalPlanner(corrected_geometry(config), config.limits, config.period)
-    run = planner.plan(PoseGoal(*target.tolist()), Schedule(rest(begin), config.period), 1.0, 3).run
+    run = planner.plan(PoseGoal(*target.tolist()), Schedule(rest(begin.tolist()), config.period), 1.0, 3).run
     with pytest.raises(RefusedError) as refused:
         placed(kind, run, Mark("valve", at=Crossing(x=-0.01)))
     assert "the path goes from 0 to " in str(refused.value)
