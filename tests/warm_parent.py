@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import io
 import json
 import os
 import select
@@ -101,9 +102,13 @@ def _program(request: dict[str, object], outputs: list[int]) -> NoReturn:
         os.environ.update(environment)
         os.setsid()
         die_with_parent(signal.SIGTERM)  # even if the parent is killed; it ends with the tests
-        for output, stream in zip(outputs, (sys.stdout, sys.stderr), strict=True):
+        for output, name in zip(outputs, ("stdout", "stderr"), strict=True):
+            stream = getattr(sys, name)
             os.dup2(output, stream.fileno())
             os.close(output)
+            # A new stream: the old one takes its file for what it was, one with a place in it or a pipe.
+            raw = os.fdopen(stream.fileno(), "wb", closefd=False)
+            setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, stream.errors))
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
         sys.argv = ["trirail", *arguments]

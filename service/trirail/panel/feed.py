@@ -88,7 +88,7 @@ class Feed:
         return [event for event in sorted({*self._alignment_events, *self._events}) if event[0] > after]
 
     def is_fresh(self, seen: int) -> bool:
-        """Return whether the state with the stamp `seen` is new enough for a request that does more than reduce motion."""
+        """Return whether the state with the stamp `seen` is new enough for what does more than reduce motion."""
         return now() - seen <= self._info.state_timeout(MAX_STATE_AGE_S) * 1e3
 
     def find_obstacle(self, goal: PoseGoal) -> Obstacle | None:
