@@ -147,3 +147,15 @@ def test_a_file_is_sent_once_and_again_only_to_a_server_that_has_it_not(browser:
     assert time.monotonic() < deadline
     page.evaluate("localStorage.clear()")
     page.close()
+
+
+@pytest.mark.viewer
+@needs_chromium
+def test_a_file_that_cannot_be_read_any_more_is_told(enabled: Page) -> None:
+    """As one that was deleted, or that another program has written to, since it was chosen."""
+    enabled.evaluate(
+        "void (Blob.prototype.arrayBuffer = async () => { throw new DOMException('', 'NotReadableError'); })"
+    )
+    choose(enabled, circle(0.01), "gone.csv")
+    enabled.until("document.querySelector('#file-says').textContent === 'gone.csv cannot be read: choose it again'")
+    assert enabled.evaluate("document.querySelector('#follow').disabled")

@@ -115,9 +115,13 @@ export class Following {
       byId("file-says").textContent = say("file.large", file);
       return this.draw();
     }
-    const bytes = new Uint8Array(await file.arrayBuffer());
+    const content = await file.arrayBuffer().catch(() => null); // of a file that has been deleted, there is none
     if (number !== this.number) return; // another one has been chosen meanwhile
-    this.file = { number, name: file.name, bytes };
+    if (!content) {
+      byId("file-says").textContent = say("file.unreadable", file);
+      return this.draw();
+    }
+    this.file = { number, name: file.name, bytes: new Uint8Array(content) };
     this.upload();
   }
 
