@@ -8,6 +8,7 @@ import time
 import msgspec
 import pytest
 from chromium import Page, needs_chromium
+from generated import thinned
 from panel.conftest import SHOWN
 from panel.fake_robot import FakeRobot
 from panel.test_gamepad import settle
@@ -257,7 +258,7 @@ def test_under_a_lease_of_another_what_is_not_everybodys_is_disabled(enabled: Pa
     enabled.until("!document.querySelector('.hold').disabled")
 
 
-@pytest.mark.parametrize("by", ["mouse", "finger", "key"])
+@pytest.mark.parametrize("by", thinned(["mouse", "finger", "key"], every=3))
 def test_a_disabled_control_says_why_where_it_is_pressed(enabled: Page, robot: FakeRobot, by: str) -> None:
     robot.holder = "bob"
     enabled.until("document.querySelector('.hold').disabled")

@@ -34,6 +34,19 @@ def test_wrong(a, b):
 def test_seeded(seed, kind):
     assert seed < 3
 
+@pytest.mark.long
+@pytest.mark.parametrize("case", range(10))
+def test_long(case):
+    with open("cases", "a") as file:
+        file.write(str(case))
+
+@pytest.mark.core
+@pytest.mark.long
+@pytest.mark.parametrize("case", range(4))
+def test_core(case):
+    with open("core", "a") as file:
+        file.write(str(case))
+
 def test_plain():
     raise AssertionError("it is not generated")
 """
@@ -43,7 +56,8 @@ CONSTANTS = "VALUES = [" + ", ".join(str(10_007 * n) for n in range(500)) + "]\n
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A project of its own with generated tests, and a module full of constants that is local to it."""
-    (tmp_path / "pytest.ini").write_text(f"[pytest]\npythonpath = {TESTS} .\n", encoding="utf-8")
+    settings = f"[pytest]\npythonpath = {TESTS} .\nmarkers =\n  long\n  core\n"
+    (tmp_path / "pytest.ini").write_text(settings, encoding="utf-8")
     (tmp_path / "conftest.py").write_text('pytest_plugins = ["generated"]\n', encoding="utf-8")
     (tmp_path / "test_some.py").write_text(SOME, encoding="utf-8")
     (tmp_path / "many.py").write_text(CONSTANTS, encoding="utf-8")
@@ -67,6 +81,19 @@ def test_a_test_has_the_same_examples_alone_and_in_company(folder: Path) -> None
         drawn.append((folder / "drawn").read_bytes())
         (folder / "drawn").unlink()
     assert drawn[0] == drawn[1] == drawn[2]
+
+
+@pytest.mark.parametrize(("effort", "number"), [("1", 10), ("0.3", 3), ("0.01", 1)])
+def test_with_less_effort_there_are_fewer_cases_of_what_is_long(folder: Path, effort: str, number: int) -> None:
+    said = []
+    for _ in range(2):
+        assert pytest_in(folder, "--effort", effort, "-k", "long or core") == 0
+        cases, core = (folder / "cases").read_text(), (folder / "core").read_text()
+        assert (len(set(cases)), len(cases), core) == (number, number, "0123")
+        said.append(cases)
+        for name in ("cases", "core"):
+            (folder / name).unlink()
+    assert said[0] == said[1]
 
 
 def test_with_less_effort_there_are_fewer_examples_and_seeds_and_the_same_at_every_run(folder: Path) -> None:
