@@ -329,6 +329,7 @@ def test_a_list_that_cannot_be_made_is_never_called_empty(
 ) -> None:
     record(tmp_path)
     page.choose("#language", language)
+    page.until(f"document.documentElement.lang === {language!r}")
 
     def fail(*_: object, **__: object) -> Any:
         if failure == "timeout":
