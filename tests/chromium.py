@@ -159,6 +159,11 @@ class Page:
             " field.dispatchEvent(new Event('input', {bubbles: true})); })()"
         )
 
+    def show_language(self, code: str) -> None:
+        """Choose the language of the page, and wait until its words have arrived."""
+        self.choose("#language", code)
+        self.until(f"document.documentElement.lang === {code!r}")
+
     def choose(self, selector: str, value: str) -> None:
         """Choose one of a list, as by its keys."""
         self.evaluate(

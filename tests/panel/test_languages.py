@@ -177,8 +177,7 @@ def test_no_word_is_broken_and_none_sticks_out(browser: Page, robot: FakeRobot) 
         page.until(SHOWN)
         for (width, height, phone), code in itertools.product(SIZES.values(), FILES):
             page.resize(width, height, phone=phone)
-            page.choose("#language", code)
-            page.until(f"document.documentElement.lang === {code!r}")
+            page.show_language(code)
             for view in ("following", "to-pose"):
                 page.click(f"[data-view={view}]")
                 assert page.evaluate(BROKEN) == [], (code, width, view)

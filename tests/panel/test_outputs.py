@@ -41,7 +41,7 @@ def test_a_value_is_seen_by_a_word_and_a_lamp_until_contact_is_lost(
     page: Page, robot: FakeRobot, element: str, language: str, words: list[str], scheme: str
 ) -> None:
     page.colours(scheme)
-    page.choose("#language", language)
+    page.show_language(language)
     name = "valve" if element.startswith("#outputs") else "part"
     shown = f"document.querySelector({element!r}).innerText.split(/\\s+/)"
     lamp = f"getComputedStyle(document.querySelector({element + ' .lamp'!r})).backgroundColor"

@@ -82,7 +82,7 @@ def test_no_control_moves_because_of_a_state(browser: Page, size: str, role: Rol
         page.resize(width, height, phone=phone)
         page.until("document.body.dataset.contact === 'yes'")  # its script listens to the choice of a language
         for code in ("de", "en"):
-            page.choose("#language", code)
+            page.show_language(code)
             page.until(f"document.documentElement.lang === {code!r} && document.body.dataset.contact === 'yes'")
             before = measure(page)
             assert len(before) > 30 if role is Role.MAINTAINER else before

@@ -91,8 +91,7 @@ def test_no_line_outlives_the_contact(enabled: Page, robot: FakeRobot) -> None:
 def test_without_the_service_s_states_a_stop_is_sent_and_the_page_does_not_deny_it(
     enabled: Page, robot: FakeRobot, language: str, words: str
 ) -> None:
-    enabled.choose("#language", language)
-    enabled.until(f"document.documentElement.lang === {language!r}")
+    enabled.show_language(language)
     robot.silent.set()
     enabled.until(f"document.querySelector('header').textContent.includes({words!r})")
     enabled.click("#stop")
@@ -130,7 +129,7 @@ def test_nothing_moves_and_the_cure_is_told_while_a_later_service_is_not_underst
     enabled: Page, robot: FakeRobot, language: str, later: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed, "USERS_PERIOD_S", 0.05)
-    enabled.choose("#language", language)
+    enabled.show_language(language)
     robot.silent.set()
     enabled.until("document.body.dataset.contact === 'none'")
     before, robot.told = robot.told, msgspec.structs.replace(robot.told, **later)
@@ -148,7 +147,7 @@ def test_nothing_moves_and_the_cure_is_told_while_a_later_service_is_not_underst
 
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_a_pose_of_another_geometry_is_marked_and_asks_first(enabled: Page, robot: FakeRobot, language: str) -> None:
-    enabled.choose("#language", language)
+    enabled.show_language(language)
     robot.foreign, old = {"old", "older"}, "[data-pose=old]"
     for name in ("new", "old", "older"):
         robot.teach(name)
@@ -199,7 +198,7 @@ def test_contact_stays_and_the_robot_goes_where_states_are_rare(
 def test_a_position_that_is_not_homed_is_not_shown_as_measured(
     page: Page, robot: FakeRobot, homed: tuple[bool, bool, bool], language: str
 ) -> None:
-    page.choose("#language", language)
+    page.show_language(language)
     drawn = "document.querySelector('.platform').getBoundingClientRect().width > 0"
     cells = "[...document.querySelectorAll('#{} tr')].map((row) => row.cells[1].innerText)"
     page.until(f"{drawn} && {cells.format('sliders')}[0].includes('mm')")
@@ -223,8 +222,7 @@ def test_what_is_pressed_on_a_page_that_is_late_is_refused_in_words(
     wait_until(lambda: robot.mode == "moving", "it goes")
     robot.mode = "holding"  # paused
     enabled.until("!document.querySelector('[data-command=resume]').disabled")
-    enabled.choose("#language", language)
-    enabled.until(f"document.documentElement.lang === {language!r}")
+    enabled.show_language(language)
     monkeypatch.setattr(feed.Feed, "is_fresh", lambda *_: False)
     before, why = robot.pose, {"en": "the page showed no state", "de": "die Anzeige war nicht aktuell"}[language]
     enabled.click("[data-step='1']")
@@ -524,7 +522,7 @@ def test_step_buttons_show_their_units(page: Page) -> None:
 
 
 def test_german_has_decimal_commas_and_words_for_what_the_service_says(page: Page, robot: FakeRobot) -> None:
-    page.choose("#language", "de")
+    page.show_language("de")
     page.until("document.documentElement.lang === 'de'")
     robot.pose = (0.0321, -0.0123, -0.2)
     page.until("document.querySelector('#pose').innerText.includes('32,10 mm')")

@@ -328,8 +328,7 @@ def test_a_list_that_cannot_be_made_is_never_called_empty(
     page: Page, robot: FakeRobot, tmp_path: Path, language: str, failure: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record(tmp_path)
-    page.choose("#language", language)
-    page.until(f"document.documentElement.lang === {language!r}")
+    page.show_language(language)
 
     def fail(*_: object, **__: object) -> Any:
         if failure == "timeout":

@@ -128,8 +128,7 @@ def test_a_file_is_sent_once_and_again_only_to_a_server_that_has_it_not(browser:
         sent = page.evaluate("sizes.length")
         assert sent >= 2
         for language in ("de", "en"):
-            page.choose("#language", language)
-            page.until(f"document.documentElement.lang === {language!r}")
+            page.show_language(language)
         page.click("#stretch")
         may(page, "yes")
         page.click("#follow")
