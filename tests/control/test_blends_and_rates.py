@@ -129,6 +129,55 @@ def test_a_goal_with_own_limits_preempts_a_motion_above_full_speed_within_them(w
     assert np.abs(np.diff(accelerations, axis=0)).max() / session.config.period <= OWN_JERK * 1.01
 
 
+@pytest.mark.generated(*range(12))
+def test_a_goal_keeps_its_own_limits_while_it_is_paused_and_resumed_and_its_override_changes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    session = Session()
+    session.post("g", PoseGoal(0.1, 0.02, rng.uniform(-0.1, 0.1), limits=OWN))
+    for _ in range(6):
+        session.cycles(int(rng.integers(1, 300)))
+        if "g" in session.ended:
+            break
+        command = Command.RESUME if session.control.state.paused else rng.choice([Command.PAUSE, Command.OVERRIDE])
+        session.order(Command(command), rng.uniform(0.0, 2.0) if command == Command.OVERRIDE else None)
+    accelerations = session.records["commanded_pose_acceleration"]
+    assert np.abs(session.records["commanded_pose_velocity"] / OWN.velocity).max() <= 1.001
+    assert np.abs(accelerations / OWN.acceleration).max() <= 1.001
+    assert np.abs(np.diff(accelerations, axis=0) / OWN.jerk).max() / session.config.period <= 1.01
+
+
+@pytest.mark.parametrize("before", ["moving", "paused"])
+def test_a_stop_does_not_wait_for_the_own_limits_of_a_goal(before: str) -> None:
+    """A stop is as quick as that of a goal without own limits, even if a slower pause has begun."""
+
+    def needed(limits: OwnLimits | None) -> int:
+        session = Session()
+        session.post("g", PoseGoal(0.1, 0.0, 0.0, speed=0.4, limits=limits))
+        session.cycles(600)
+        if before == "paused":
+            session.order(Command.PAUSE)
+            session.cycles(5)
+        session.order(Command.STOP)
+        return session.until(session.holds)
+
+    slow = OwnLimits(acceleration=(0.2, 0.2, 2.0), jerk=(1.0, 1.0, 10.0))
+    assert needed(slow) <= needed(None) + 20
+
+
+@pytest.mark.parametrize("passes", [True, False])
+@pytest.mark.parametrize("wait", [1, 20, 60])
+def test_a_goal_with_own_limits_pauses_while_the_motion_is_still_faster(wait: int, passes: bool) -> None:
+    session = Session()
+    session.post("a", PoseGoal(0.03, 0.0, 0.0, blend=0.02 if passes else None))
+    session.cycles(60)
+    session.post("b", PoseGoal(0.03, 0.08, 0.0, limits=OwnLimits(velocity=(0.01, 0.01, 0.1))))
+    session.until(lambda: "a" in session.ended)
+    session.cycles(wait)
+    session.order(Command.PAUSE)
+    assert session.until(session.holds) < 400
+    assert session.control.state.paused
+
+
 @pytest.mark.parametrize("how", ["ends", "stopped"])
 def test_the_override_acts_again_when_the_goal_that_forbids_it_has_gone(how: str) -> None:
     """A goal with own limits runs at 100 % at most, and so does the motion before it, but not the next goal."""

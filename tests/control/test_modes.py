@@ -51,9 +51,9 @@ def each(states: set[ModeState], comes: Step | RefusalCode) -> Changes:
 
 ENDED: Changes = {
     ENABLING: Step(DISABLED, Action.POWER_DOWN),
-    MOVING: Step(STOPPING, Action.BRAKE),
+    **each({MOVING, PAUSING}, Step(STOPPING, Action.BRAKE)),
     HOMING: Step(STOPPING, Action.STOP_HOMING),
-    **each({PAUSING, RELEASING}, Step(STOPPING)),
+    RELEASING: Step(STOPPING),
 }
 """What is under way is ended by a stop that leaves the power on."""
 AT_REST: Changes = {
@@ -86,15 +86,15 @@ RULES = [
         {E.DISABLE, E.SHUTDOWN},
         {
             **each({ENABLING, HOLDING, PAUSED}, Step(DISABLED, Action.POWER_DOWN)),
-            MOVING: Step(STOPPING_TO_DISABLE, Action.BRAKE),
+            **each({MOVING, PAUSING}, Step(STOPPING_TO_DISABLE, Action.BRAKE)),
             HOMING: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
-            **each({STOPPING, PAUSING, RELEASING}, Step(STOPPING_TO_DISABLE)),
+            **each({STOPPING, RELEASING}, Step(STOPPING_TO_DISABLE)),
         },
     ),
     Rule("a stop and a lost gateway end all", {E.STOP, E.GATEWAY_LOST}, ENDED | {PAUSED: Step(HOLDING)}),
     Rule("lateness ends what moves", {E.LATE}, ENDED),
     Rule("what brakes comes to rest", {E.STANDSTILL}, AT_REST),
-    Rule("at the end nothing is left to resume", {E.ARRIVED}, AT_REST | each({PAUSING, MOVING}, Step(HOLDING))),
+    Rule("at the end nothing is left to resume", {E.ARRIVED}, AT_REST | each({PAUSING, PAUSED, MOVING}, Step(HOLDING))),
     Rule(
         "a goal begins where the robot holds, or in the place of another",
         {E.GOAL},

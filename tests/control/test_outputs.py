@@ -458,6 +458,22 @@ def test_a_section_ends_at_its_end_or_at_the_edge_that_ends_its_goal(rig: Rig, s
     assert len(rig.switches) == len(rig.changes("valve"))
 
 
+@pytest.mark.parametrize("later", [1, 30, 400])
+def test_an_edge_ends_a_goal_that_is_not_in_position(rig: Rig, later: int) -> None:
+    """Its path has ended, but slider A is beside its setpoint, for instance because the platform touches the part."""
+    write = rig.drives.write
+    rig.drives.write = lambda position, velocity: write((position[0] + 3e-4, *position[1:]), velocity)  # type: ignore[method-assign]
+    rig.send("g", PoseGoal(0.02, 0.0, 0.0, stop_at=StopAt("part")))
+    rig.until(lambda: rig.control.measured.settling.under_way, 5000)
+    rig.cycles(later)
+    assert rig.mode is Mode.MOVING
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.cycles(3)
+    assert rig.holds()
+    (end,) = (notice for notice in rig.notices if notice.kind == "goal")
+    assert (end.outcome, end.reason, end.event_code) == ("done", "input part rising", EventCode.INPUT_REACHED)
+
+
 def test_goals_behind_one_that_ends_at_an_edge_do_not_run(rig: Rig) -> None:
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.2, blend=0.001, stop_at=StopAt("part")))
     assert isinstance(rig.send("g2", PoseGoal(0.0, 0.03, 0.0, blend=0.001)), Accepted)

@@ -282,6 +282,60 @@ def test_what_was_sent_before_a_pause_does_not_begin(slow: ControlRig) -> None:
     assert len(tickets) == len(set(tickets)) == 2  # each is answered once
 
 
+@pytest.mark.parametrize("delay", [20, 300])
+@pytest.mark.generated(*range(6))
+def test_a_goal_that_is_still_planned_does_not_begin_after_a_pause(delay: int, seed: int) -> None:
+    """The robot stands and holds, so there is no goal to resume: the pause is confirmed, and the goal is stopped."""
+    rng = np.random.default_rng(seed)
+    rig = ControlRig(delay=delay)
+    rig.enable()
+    for number in range(int(rng.integers(1, 4))):
+        rig.post(f"g{number}", PoseGoal(*rng.uniform(-0.03, 0.03, 3).tolist()))
+    rig.cycles(int(rng.integers(1, delay - 8)))
+    number = len(rig.rows)
+    assert confirmed_after(rig, "pause", PROMPT) <= 5
+    rig.cycles(2 * delay + 50)
+    assert rig.holds()
+    assert {outcome for _, outcome in rig.outcomes()} == {"stopped"}
+    assert all(row == rig.rows[number] for row in rig.rows[number:])
+
+
+@pytest.mark.parametrize("pauses", [False, True])
+@pytest.mark.generated(*range(6))
+def test_a_goal_that_waits_at_the_start_of_its_path_expires(seed: int, pauses: bool) -> None:
+    """With an override of 0, a goal is accepted and does not move the robot, not even when the override rises later."""
+    rng = np.random.default_rng(seed)
+    rig = ControlRig()
+    rig.enable()
+    rig.cycle(CommandRequest(50, "ann", Command.OVERRIDE, Override(0.0)))
+    valid = round(rng.uniform(0.05, 0.4), 3)
+    goals = [f"g{number}" for number in range(int(rng.integers(1, 4)))]
+    for name in goals:
+        x, y, phi = rng.uniform(-0.03, 0.03, 3).tolist()
+        rig.send(name, PoseGoal(x, y, phi, valid_for=valid, blend=0.001))
+    if pauses:
+        rig.command("pause")
+    rig.cycles(round(valid / PERIOD) + 5)
+    assert rig.holds()
+    assert not rig.control.state.paused
+    assert dict(rig.outcomes()) == dict.fromkeys(goals, "stopped") | {"g0": "expired"}
+    assert isinstance(rig.command("override", 1.0), CommandDone)
+    rig.cycles(100)
+    assert all(row == rig.rows[5] for row in rig.rows[5:])
+
+
+@pytest.mark.parametrize("override", [0.0, 0.01, 1.0])
+def test_a_goal_that_has_begun_does_not_expire(rig: ControlRig, override: float) -> None:
+    rig.enable()
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, valid_for=0.2))
+    rig.cycles(50)
+    rig.cycle(CommandRequest(50, "ann", Command.OVERRIDE, Override(override * 100.0)))
+    rig.cycles(400)
+    rig.cycle(CommandRequest(51, "ann", Command.OVERRIDE, Override(100.0)))
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g1", "done")]
+
+
 def test_a_goal_sent_twice_and_then_paused_goes_on_when_it_is_resumed_and_ends_once(rig: ControlRig) -> None:
     rig.enable()
     rig.planner.delay = 20

@@ -12,7 +12,7 @@ from trirail.control.feedback import CAN_MOVE, MeasuredState
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.lease import LeaseArbiter, LeaseChange
 from trirail.control.ledger import Ledger
-from trirail.control.modes import Action, ModeEvent
+from trirail.control.modes import HOLDING, Action, ModeEvent
 from trirail.control.outputs import Outputs
 from trirail.control.plan_requests import PlanRequests
 from trirail.control.setpoints import Setpoints
@@ -159,11 +159,9 @@ class Commands:
     def _change_mode(self, request: CommandRequest) -> None:
         """Apply the mode event that has the same name as the command."""
         event, reason = ModeEvent[request.name.name], _reason(request)
-        action = self._modes.check(event).action
-        goal = self._ledger.goal
-        if event is ModeEvent.PAUSE and ((goal is not None and goal.kind.renewed) or self._planner.needs_old_motion):
-            # Jogs and tracks cannot be resumed: the key of a jog has been released, the target of a track has moved on.
+        if event is ModeEvent.PAUSE and self._pauses_for_good:
             event = ModeEvent.STOP
+        action = self._modes.check(event).action
         if action is Action.POWER_UP and self._measured.powered:
             words = f"{_powered_drives(self._measured)}: send enable again when no drive has power"
             raise RefusedError(RefusalCode.STOPPING, words)
@@ -180,6 +178,16 @@ class Commands:
         else:
             self._modes.apply_event(event, reason)
             self._modes.withdraw(event, reason)
+
+    @property
+    def _pauses_for_good(self) -> bool:
+        """Whether a pause would leave no goal that could be resumed, so that it is a stop.
+
+        Jogs and tracks cannot be resumed: the key of a jog has been released, the target of a track has moved on. A
+        goal that has not begun does not start after a pause.
+        """
+        goal, waits = self._ledger.goal, self._modes.state == HOLDING and not self._goal_queue.idle
+        return waits or (goal is not None and goal.kind.renewed) or self._planner.needs_old_motion
 
     def _stop(self, request: CommandRequest) -> None:
         """Stop the robot. If the command names a goal that has not begun, stop only that goal."""

@@ -441,7 +441,8 @@ class Control:
             if code and schedule.runs:
                 for _ in range(schedule.end_cycle(schedule.runs[0])):
                     self.ledger.pass_on()
-            self.goal_queue.expire(self.modes.cycle)
+            if self.goal_queue.expire(self.modes.cycle):
+                self.modes.apply_event(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
             self._check_arrival()
             moves = self.state.mode in (Mode.MOVING, Mode.STOPPING)
             if code and moves and schedule.runs and schedule.runs[0].at_rest:
@@ -604,7 +605,7 @@ class Control:
             self.modes.apply_event(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
         elif self.state.mode is Mode.MOVING and goal is not None and goal.kind.waits_at_end:
             return  # the goal is waiting to be renewed
-        elif goal is None or not goal.settles:
+        elif goal is None or not goal.settles or self.state.released:
             self.modes.apply_event(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
         elif not settling.under_way:
             settling.begin(self.modes.cycle)

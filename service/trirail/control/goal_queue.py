@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from trirail.control.lease import LeaseArbiter
-from trirail.control.ledger import Ledger, Withdrawal
+from trirail.control.ledger import ActiveGoal, Ledger, Withdrawal
 from trirail.control.outputs import Outputs
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
@@ -78,7 +78,7 @@ class GoalQueue:
 
         `cycle` is the number of the next cycle.
         """
-        expiring = min((goal.expires for number, goal in enumerate(self._ledger.goals) if number), default=math.inf)
+        expiring = min((goal.expires for goal in self._not_begun), default=math.inf)
         if self._planner.busy and self._planned is not None:
             request, sent, _ = self._planned
             if self._is_passed(self._planned):
@@ -191,12 +191,22 @@ class GoalQueue:
                 return True
         raise RefusedError(RefusalCode.NO_GOAL, f"goal {goal_id!r} is not in progress: it has ended or was never sent")
 
-    def expire(self, cycle: int) -> None:
-        """End planned goals that can no longer begin in time, together with the goals that follow them."""
-        for number, goal in enumerate(self._ledger.goals):
-            if number and cycle > goal.expires:
-                self._drop(number, goal.id, "expired", coded("the goal did not start in time", EventCode.TOO_LATE))
-                return
+    def expire(self, cycle: int) -> bool:
+        """End planned goals that can no longer begin in time, together with the goals that follow them.
+
+        Return whether the current goal has ended, because a pause or an override of 0 has kept it at its start.
+        """
+        late = next((goal for goal in self._not_begun if cycle > goal.expires), None)
+        if late is None:
+            return False
+        number, reason = self._ledger.goals.index(late), coded("the goal did not start in time", EventCode.TOO_LATE)
+        self._drop(number, late.id, "expired", reason)
+        return number == 0
+
+    @property
+    def _not_begun(self) -> list[ActiveGoal]:
+        """Planned goals that have not begun to move the robot."""
+        return list(self._ledger.goals)[0 if self._schedule.has_not_begun else 1 :]
 
     def _next(self) -> _ReceivedGoal:
         """Remove and return the oldest waiting goal of the user who was served least recently."""
@@ -289,8 +299,9 @@ class GoalQueue:
         before = coded(words, EventCode.EARLIER_GOAL_ENDED, goal=goal_id, outcome=outcome)
         self._ledger.end("stopped", before, but=number + 1)
         self._ledger.end(outcome, reason, but=number)
-        self._schedule.drop(number - 1)
-        self._planner.update_rate()
+        if number:
+            self._schedule.drop(number - 1)
+            self._planner.update_rate()
         if self._planner.busy and self._planned is not None:
             # The goal in planning would follow a dropped goal, so it is planned again.
             self._planner.cancel()

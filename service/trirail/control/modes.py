@@ -187,17 +187,17 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
     },
     PAUSING: _IN_ALL_MODES
     | {
-        ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
+        ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE, Action.BRAKE),
         ModeEvent.GOAL: Step(MOVING, Action.START),
-        ModeEvent.STOP: Step(STOPPING),
+        ModeEvent.STOP: Step(STOPPING, Action.BRAKE),
         ModeEvent.RESUME: Step(MOVING, Action.RESUME),
         ModeEvent.INPUT_EDGE: Step(RELEASING, Action.BRAKE),
         ModeEvent.HOME: _PAUSED,
         ModeEvent.STANDSTILL: Step(PAUSED),
         ModeEvent.ARRIVED: Step(HOLDING),
-        ModeEvent.GATEWAY_LOST: Step(STOPPING),
-        ModeEvent.LATE: Step(STOPPING),
-        ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE),
+        ModeEvent.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),
+        ModeEvent.LATE: Step(STOPPING, Action.BRAKE),
+        ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.BRAKE),
     },
     PAUSED: _IN_ALL_MODES
     | {
@@ -206,6 +206,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.STOP: Step(HOLDING),
         ModeEvent.RESUME: Step(MOVING, Action.RESUME),
         ModeEvent.INPUT_EDGE: Step(HOLDING),
+        ModeEvent.ARRIVED: Step(HOLDING),
         ModeEvent.HOME: _PAUSED,
         ModeEvent.GATEWAY_LOST: Step(HOLDING),
         ModeEvent.SHUTDOWN: _POWER_OFF,

@@ -25,7 +25,7 @@ from trirail.motion.motion_planner import revision
 from trirail.motion.packing import pack_run, unpack_law, unpack_path, unpack_run
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.rate_change import RateChange
-from trirail.motion.runs import ZERO_RATES, MotionState, Run, nominal_motion, rest
+from trirail.motion.runs import ZERO_RATES, MotionState, OwnBounds, Run, nominal_motion, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import Goal
@@ -181,10 +181,15 @@ class PlanRequests:
         runs = self._schedule.runs
         return len(runs) > 1 and runs[0].target != 0.0
 
-    def set_running(self, running: bool) -> None:
-        """Run the current motion at the speed override, or brake to a standstill."""
-        self._running = running
+    def run(self) -> None:
+        """Run the current motion at the speed override."""
+        self._running = True
         self._start_rate_change()
+
+    def brake(self, *, stops: bool) -> None:
+        """Brake the current motion to a standstill on its path; with `stops`, regardless of the goal's own limits."""
+        self._running = False
+        self._start_rate_change(stops=stops)
 
     def update_rate(self) -> None:
         """Adapt the rate of the current motion to a new override or a changed path, unless the motion is braking."""
@@ -261,6 +266,16 @@ class PlanRequests:
         return self._goal.greatest_rate if self._goal is not None else math.inf
 
     @property
+    def _own_bounds(self) -> OwnBounds:
+        """Bounds of the goal being planned."""
+        own = self._goal.limits if self._goal is not None else None
+        if own is None:
+            return OwnBounds(self._goal_rate)
+        rates = own.velocity, own.acceleration, own.jerk
+        limits = np.array([each if each is not None else (math.inf,) * 3 for each in rates]).T
+        return OwnBounds(self._goal_rate, limits)
+
+    @property
     def _extends_motion(self) -> bool:
         """Whether the goal being planned follows the current motion without preempting it."""
         return self._blend is not None and self._schedule.last is not None and not self._schedule.ended
@@ -273,10 +288,10 @@ class PlanRequests:
             return False
         return max(last.law_state.rate, last.target) > self._goal_rate
 
-    def _start_rate_change(self) -> None:
+    def _start_rate_change(self, *, stops: bool = False) -> None:
         """Start changing the rate of the current motion to its target."""
         self._wanted_rate = self._rate
-        self._change = RateChange(self._scaling, self._schedule, self._rate, self._period)
+        self._change = RateChange(self._scaling, self._schedule, self._rate, self._period, stops=stops)
 
     def _change_rate(self) -> None:
         if self._running and self._rate != self._wanted_rate:  # a goal that allows only a lower rate has come or gone
@@ -341,7 +356,7 @@ class PlanRequests:
             self._request = None  # too late
             return None
         run = self._planned_run or unpack_run(self._legs, planned.run)
-        run.greatest_rate = self._goal_rate
+        run.own = self._own_bounds
         run.marks.append(self._marks(planned.switches))
         runs = deque([run])
         if planned.reply.stops_first and schedule.runs:
@@ -395,7 +410,7 @@ class PlanRequests:
         ):
             self._request = None
             return None
-        schedule.append(extended.s, path, self._marks(extended.switches), self._goal_rate)
+        schedule.append(extended.s, path, self._marks(extended.switches), self._own_bounds)
         return AcceptedPlan(extended.reply.with_duration(schedule.remaining if run.target else math.inf))
 
 

@@ -116,7 +116,7 @@ class Transitions:
         if self.state.mode is not before.mode:
             self.entered = self.cycle
             self._setpoints.allow(self.state.mode)
-        if goal is not None or not self.state.has_goal:
+        if goal is not None or not self.state.has_goal or self.state.released:
             self._measured.settling.cancel()
         if not self.state.has_goal:
             self._schedule.stop_on_path()  # also while the robot brakes; otherwise the next goal could begin
@@ -174,6 +174,6 @@ class Transitions:
             case Action.BRAKE:
                 if not decided.state.paused:  # brake within the current path; later goals must not begin
                     self._schedule.stop_on_path()
-                self._planner.set_running(False)
+                self._planner.brake(stops=not decided.state.paused)
             case Action.RESUME:
-                self._planner.set_running(True)
+                self._planner.run()

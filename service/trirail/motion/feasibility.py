@@ -170,11 +170,14 @@ class Checker:
         self._box = np.array([platform.x, platform.y, platform.phi, *slider.positions, *[slider.passive] * 3]).T.copy()
         self._tolerance = standing_tolerance(limits, geometry.arm)
 
-    def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
+    def sample(
+        self, path: Path, law: Path, first: float, until: float, pose: Sequence[float], own: Array | None = None
+    ) -> SampleResult:
         """Sample a path under a law between two times of the law [s].
 
-        `pose` selects the branch of the forward kinematics for the first sample. Each call also calls `beat`, because
-        every loop in the planner samples a path in each iteration.
+        `pose` selects the branch of the forward kinematics for the first sample. The motion is also within limits only
+        if it keeps `own`, the limits of its goal; see OwnBounds. Each call also calls `beat`, because every loop in the
+        planner samples a path in each iteration.
         """
         self._beat()
         until = max(first, until)
@@ -197,8 +200,9 @@ class Checker:
             self._shares,
             worst,
         )
+        keeps_own = own is None or bool((worst[1:4] <= own * ROUNDING_FACTOR).all())
         worst /= self._planned
-        within_limits = math.isnan(leaves_at) and self.keeps_limits(worst) and not law_falls(*law[:2])
+        within_limits = math.isnan(leaves_at) and keeps_own and self.keeps_limits(worst) and not law_falls(*law[:2])
         return SampleResult(worst, within_limits, leaves_at)
 
     def keeps_limits(self, worst: Array) -> bool:

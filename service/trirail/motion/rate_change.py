@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trirail.kinematics.arrays import Array
 from trirail.motion.feasibility import SUBJECTS, SampleResult, parts
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run, arrival_time
@@ -32,6 +33,8 @@ class _Part(NamedTuple):
     path: Path
     first: float
     until: float
+    own: Array | None
+    """Limits of the goal to which this part belongs, as in OwnBounds."""
 
 
 class _Candidate(NamedTuple):
@@ -50,14 +53,19 @@ class RateChange:
     The old law remains in use until a new law has been checked completely. While the rate is changing, the search for a
     quicker change continues, because a slower motion leaves a larger part of the limits free. A motion that has not
     begun yet begins at the new rate.
+
+    The goals' own limits also apply, unless the change is a stop, or a faster motion passes into a goal with limits.
     """
 
-    def __init__(self, scaling: TimeScaling, schedule: Schedule, rate: float, period: float) -> None:
+    def __init__(
+        self, scaling: TimeScaling, schedule: Schedule, rate: float, period: float, *, stops: bool = False
+    ) -> None:
         self.rate = rate
         self.cycles = 0
         """Number of cycles since the change was requested."""
         self.applied = False
         """Whether the motion has a law that leads to the new rate. Further cycles can only make the change quicker."""
+        self._stops = stops
         self._scaling = scaling
         self._schedule = schedule
         self._period = period
@@ -108,6 +116,7 @@ class RateChange:
         self._motion_key = schedule.version, len(schedule.runs)
         self._possible = self.rate
         self._share = 0
+        self._keeps_own = not self._stops
         self._candidate: _Candidate | None = None
         self._unsampled: list[_Part] | None = None
         self._first_s = 0.0
@@ -120,7 +129,7 @@ class RateChange:
     def _search_greatest_rate(self) -> None:
         """Sample one part of the remaining path. After the last part, compute the greatest possible rate."""
         if self._unsampled:
-            path, first, until = self._unsampled.pop()
+            path, first, until, _ = self._unsampled.pop()
             result = self._scaling.sample(
                 path, constant_law(1.0, self._first_s), first, until, self._schedule.commanded.pose
             )
@@ -143,8 +152,9 @@ class RateChange:
             self._next_share()
             return
         if candidate.ahead:
-            path, first, until = candidate.ahead.pop()
-            result = self._scaling.sample(path, candidate.law, first, until, self._schedule.commanded.pose)
+            path, first, until, own = candidate.ahead.pop()
+            pose = self._schedule.commanded.pose
+            result = self._scaling.sample(path, candidate.law, first, until, pose, own if self._keeps_own else None)
             if not result.within_limits:
                 self._next_share()
                 return
@@ -156,16 +166,36 @@ class RateChange:
 
         If a following goal is dropped, the run continues under the same law on the path before this goal.
         """
-        begins = [(run.path, 0.0), *((seam.before, arrival_time(law, rate, seam.s)) for seam in run.seams)]
+        begins, own = 0.0, run.own.limits
+        whole: list[_Part] = []
+        shorter: list[_Part] = []
+        for seam in run.seams:
+            passes = arrival_time(law, rate, seam.s)
+            shorter.append(_Part(seam.before, passes, last, own))
+            if seam.own.limits is not own:
+                whole.append(_Part(run.path, begins, min(passes, last), own))
+                begins, own = passes, seam.own.limits
+        whole.append(_Part(run.path, begins, last, own))
         sampled: list[_Part] = []
-        for path, first in begins:
-            until = min(arrival_time(law, rate, path.duration), last)
+        for path, first, end, limits in whole + shorter:
+            until = min(arrival_time(law, rate, path.duration), end)
             if first <= until:
-                sampled += [_Part(path, *each) for each in parts(path, law, first, until, self._samples)]
+                sampled += [_Part(path, *each, limits) for each in parts(path, law, first, until, self._samples)]
         return sampled
 
     def _next_share(self) -> None:
         self._candidate, self._share = None, (self._share + 1) % len(CHANGE_SHARES)
+        if self._share == 0 and not self.applied:
+            self._keeps_own = self._keeps_own and self._is_within_own()
+
+    def _is_within_own(self) -> bool:
+        """Return whether the present motion keeps the own limits of its goal; False if it has none.
+
+        A faster motion exceeds them when it passes into the goal, and no change of the rate could then keep them.
+        """
+        run, pose = self._schedule.runs[-1], self._schedule.commanded.pose
+        own = run.own.limits
+        return own is not None and self._scaling.sample(run.path, run.law, run.time, run.time, pose, own).within_limits
 
     def _propose(self, run: Run) -> _Candidate | None:
         """Return a law at the current fraction of the quickest change; None if there is no suitable law.

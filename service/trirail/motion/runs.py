@@ -70,6 +70,17 @@ class LawState(NamedTuple):
     change: float
 
 
+class OwnBounds(NamedTuple):
+    """Bounds of one goal, which are lower than those of the robot."""
+
+    rate: float = math.inf
+    """Greatest rate that the goal allows."""
+    limits: Array | None = None
+    """Greatest velocity, acceleration and jerk of the goal's point in x, y and phi, (3, 3) with a row for each
+    coordinate; None if the robot's limits apply.
+    """
+
+
 class Seam(NamedTuple):
     """Time along a path at which one goal ends and the next one begins."""
 
@@ -77,8 +88,8 @@ class Seam(NamedTuple):
     """Time along the path [s]."""
     before: Path
     """Path without the next goal and the goals after it. Up to the seam, it equals the whole path."""
-    greatest_rate: float = math.inf
-    """Greatest rate that the next goal allows."""
+    own: OwnBounds = OwnBounds()
+    """Bounds of the next goal."""
 
 
 class GoalSpan(NamedTuple):
@@ -101,8 +112,8 @@ class Run:
         """Time since the start of the law [s]."""
         self.furthest = np.full(1, -np.inf)
         """Greatest time along the path that has been commanded, (1,) [s]. It never decreases."""
-        self.greatest_rate = math.inf
-        """Greatest rate that the current goal allows."""
+        self.own = OwnBounds()
+        """Bounds of the current goal."""
         self.seams: deque[Seam] = deque()
         self.marks: deque[GoalMarks] = deque()
         """Marks of the current goal and of the following goals on the path, in order; empty if no goal has marks."""
@@ -182,7 +193,7 @@ class Run:
     @property
     def allowed_rate(self) -> float:
         """Greatest rate that all goals on the path allow."""
-        return min((self.greatest_rate, *(seam.greatest_rate for seam in self.seams)))
+        return min((self.own.rate, *(seam.own.rate for seam in self.seams)))
 
     def end(self, near: Sequence[float]) -> Sequence[float]:
         """Return the pose at the end of the path, which is the target of the last goal; `near` selects the branch."""
@@ -197,12 +208,12 @@ class Run:
         """Return an independent copy of the run."""
         other = Run(self._legs, self.path, self.law, self.target)
         other.time, other.seams, other._begun = self.time, self.seams.copy(), self._begun
-        other.greatest_rate, other._withdrawn = self.greatest_rate, self._withdrawn
+        other.own, other._withdrawn = self.own, self._withdrawn
         other.furthest[:] = self.furthest
         other.marks = self.marks.copy()
         return other
 
-    def append(self, s: float, path: Path, marks: GoalMarks | None = None, greatest_rate: float = math.inf) -> None:
+    def append(self, s: float, path: Path, marks: GoalMarks | None = None, own: OwnBounds | None = None) -> None:
         """Replace the path after the time `s` by another path, which begins with the same state of motion.
 
         Marks of earlier goals after `s` are not used, unless the new goal is dropped. The part of the path that the
@@ -212,7 +223,7 @@ class Run:
         longer = joined([cut(before, s), path])
         self.marks.append(marks or GoalMarks())
         self.marks[-1].begin = s
-        self.seams.append(Seam(s, before, greatest_rate))
+        self.seams.append(Seam(s, before, own or OwnBounds()))
         self.path = longer
 
     def drop(self, number: int) -> None:
@@ -234,7 +245,7 @@ class Run:
         s, passed = self.law_state.s, 0
         while self.seams and s >= self.seams[0].s:
             seam = self.seams.popleft()
-            self._begun, self.greatest_rate, self._withdrawn = seam.s, seam.greatest_rate, None
+            self._begun, self.own, self._withdrawn = seam.s, seam.own, None
             if self.marks:
                 self.marks.popleft()
             passed += 1

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 
 import numpy as np
 
 from trirail.motion.marks import GoalMarks
 from trirail.motion.paths import Path
-from trirail.motion.runs import MotionState, Run
+from trirail.motion.runs import MotionState, OwnBounds, Run
 
 
 class Schedule:
@@ -76,14 +75,22 @@ class Schedule:
         _, *stops, run = self.runs
         return run.progress, run.remaining + sum(stop.end_time - stop.time for stop in stops)
 
+    @property
+    def has_not_begun(self) -> bool:
+        """Whether the only motion stands at its start, because its rate is 0."""
+        if len(self.runs) != 1 or self.runs[0].target != 0.0:
+            return False
+        at = self.runs[0].law_state
+        return at.s == at.rate == at.change == 0.0
+
     def replace_runs(self, runs: deque[Run]) -> None:
         """Replace all runs. The first new run must begin in the commanded state."""
         self.runs = runs
         self.version += 1
 
-    def append(self, s: float, path: Path, marks: GoalMarks | None = None, greatest_rate: float = math.inf) -> None:
+    def append(self, s: float, path: Path, marks: GoalMarks | None = None, own: OwnBounds | None = None) -> None:
         """Extend the last run by the path of another goal; see Run.append."""
-        self.runs[-1].append(s, path, marks, greatest_rate)
+        self.runs[-1].append(s, path, marks, own)
         self.version += 1
 
     def drop(self, number: int) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker, SampleResult
 from trirail.motion.paths import Path, constant_law, law_falls
@@ -63,9 +64,11 @@ class TimeScaling:
         """Return the time until which a law must be sampled [s]. Later, the rate is constant or the path is over."""
         return min(arrival_time(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
 
-    def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
+    def sample(
+        self, path: Path, law: Path, first: float, until: float, pose: Sequence[float], own: Array | None = None
+    ) -> SampleResult:
         """Sample a path under a law; see Checker.sample."""
-        return self._checker.sample(path, law, first, until, pose)
+        return self._checker.sample(path, law, first, until, pose, own)
 
     def ramp(self, at: LawState, rate: float, share: float) -> Path | None:
         """Return a law from the state `at` to a rate; None if there is none.

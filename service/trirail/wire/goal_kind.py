@@ -75,7 +75,7 @@ Speed = Annotated[
 ]
 GoalLimits = Annotated[
     OwnLimits | None,
-    Meta(description="its own velocity, acceleration, jerk, within the robot's"),
+    Meta(description="own velocity, acceleration, jerk (except in stops)"),
 ]
 Blend = Annotated[
     Annotated[float, Meta(ge=0.0, le=1e3)] | None,
