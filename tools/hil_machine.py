@@ -117,12 +117,13 @@ def script(folder: Path, packed: tuple[Path, ...], steps: Collection[str] = STEP
     """Return the shell script that the machine runs as root, with some of its STEPS."""
     commands = {
         "robots": f"{sys.executable} tools/hil_guest.py {folder}",
-        "fd": f"{sys.executable} tools/hil_fd.py guest {folder}",
+        "fd": f"{sys.executable} tools/hil_fd.py guest {folder} &  # beside the tests, which use another interface",
         # Hypothesis, which no test of these needs as a plug-in, alone takes a quarter of a minute to be loaded.
         "tests": f"""export PYTEST_DISABLE_PLUGIN_AUTOLOAD=1
 options='-p pytest_timeout -p no:cacheprovider --noconftest -m vcan -rA --tb=short'
 {sys.executable} -m pytest $options {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log
 echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
+wait
 {sys.executable} tools/bench.py frames --cycles 300 --json > {folder}/price.json""",
     }
     run = "\n".join(commands[step] for step in STEPS if step in steps)
@@ -155,6 +156,7 @@ grep -q well {folder}/{COMPILED}
 cp -r {CACHE} /dev/shm/numba
 set +e
 {run}
+wait
 """
 
 
