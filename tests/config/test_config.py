@@ -697,6 +697,49 @@ def test_the_pose_is_computed_right_from_the_sliders_wherever_a_platform_may_tur
     assert forward(robot, inverse(robot, poses).position) == pytest.approx(poses, abs=1e-7)
 
 
+ROTATIONS = st.tuples(*[st.floats(-0.9, 0.9)] * 3)
+
+
+@example(edges=(-0.012, 0.831, -0.014), rails=(0.011, -0.032, 0.016), reach=0.01, phi=0.0873)
+@given(
+    edges=ROTATIONS,
+    rails=st.tuples(*[st.floats(-0.06, 0.06)] * 3),
+    reach=st.floats(0.005, 0.04),
+    phi=st.floats(0.01, 0.3),
+)
+def test_no_permitted_pose_is_on_the_other_side_of_a_singular_pose(
+    edges: Triple, rails: Triple, reach: float, phi: float
+) -> None:
+    config = load(SIM.with_name("uvw.toml"))
+    legs = tuple(
+        LegTable(leg.anchor, leg.rail_angle + rail, leg.home, leg.edge_point, leg.edge_angle + edge)
+        for leg, rail, edge in zip(geometry(config.geometry).legs, rails, edges, strict=True)
+    )
+    ends = (-reach, reach)
+    platform = msgspec.structs.replace(config.limits.platform, x=ends, y=ends, phi=(-phi, phi))
+    limits = msgspec.structs.replace(config.limits, platform=platform, singularity_margin=0.05)
+    table = msgspec.structs.replace(config.geometry, leg=legs)
+    config = msgspec.structs.replace(config, geometry=table, limits=limits)
+    try:
+        robot = geometry(config.geometry)
+    except ConfigError:
+        reject()
+    try:
+        check(config)
+        said = ""
+    except ConfigError as error:
+        said = str(error)
+    samples = [np.linspace(*ends, 5), np.linspace(*ends, 5), np.linspace(-phi, phi, 9)]
+    poses = np.stack(np.meshgrid(*samples), axis=-1).reshape(-1, 3)
+    try:
+        regular = bool((distance_to_singularity(robot, poses) > 0.0).all())
+    except KinematicsError:
+        regular = False
+    assert regular or "singular" in said
+    if "a singular pose" in said:
+        assert not regular
+
+
 def test_the_tolerance_of_poses_is_that_of_plans() -> None:
     assert impossible.ROUNDING == paths.ROUNDING
 

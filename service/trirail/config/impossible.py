@@ -18,7 +18,7 @@ from trirail.config.explained import Mistake, overlap
 from trirail.config.network_checks import network_rules
 from trirail.config.tables import BASE, PLATFORM, Config, Limits, corrected_geometry, geometry, room
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, gains, singular_angles, travels
+from trirail.kinematics.geometry import Geometry, det_j2, gains, singular_angles, travels
 from trirail.quantities import FAMILIAR_UNITS, as_familiar_unit
 from trirail.wire.text import QUANTITY_RULE, is_quantity
 
@@ -135,10 +135,13 @@ def _size(config: Config) -> float:
 
 
 def _check_singular_angles(config: Config) -> None:
-    """Refuse a range of phi that is not between the nearest singular angles below and above zero.
+    """Refuse a range of phi that is not between the nearest singular angles below and above zero, for any centre.
 
     For each position of the sliders there are two poses, with a singular angle between them. The measured pose is the
     one on the same side as the pose (0, 0, 0). If the platform stood on the other side, it would be wrong.
+
+    At a fixed phi, det J2 is linear in x and y. If its sign at every corner of their ranges is the sign at (0, 0, 0),
+    at phi = 0 and without a singular angle up to the limits of phi, it is the same at every permitted pose.
     """
     platform = config.limits.platform
     corrected = corrected_geometry(config)
@@ -146,10 +149,17 @@ def _check_singular_angles(config: Config) -> None:
     x, y, phi = np.zeros(3) if errors is None else errors.bound  # the legs receive poses this far beyond the limits
     margin = config.limits.singularity_margin
     low, high = platform.phi[0] - phi - margin, platform.phi[1] + phi + margin
-    # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
     beside = [(low - more, high + more) for (low, high), more in ((platform.x, x), (platform.y, y))]
     centres = [(0.0, 0.0), *itertools.product(*beside)]
     robot = geometry(config.geometry)
+    determinants = [float(det_j2(robot, centre, np.zeros(1))[0]) for centre in centres]
+    for corner, determinant in zip(centres, determinants, strict=True):
+        if determinant * determinants[0] <= 0.0:
+            raise ConfigError(
+                f"limits.platform.x = [{platform.x[0]:g}, {platform.x[1]:g}] and "
+                f"limits.platform.y = [{platform.y[0]:g}, {platform.y[1]:g}] extend beyond a singular pose at phi = 0, "
+                f"between (0, 0) and ({corner[0]:g}, {corner[1]:g}); narrow them, or correct the geometry"
+            )
     singular = {
         angle + turn
         for centre in centres
