@@ -44,6 +44,7 @@ from trirail.wire.goals import PoseGoal
 from trirail.wire.vocabulary import Mode
 from trirail.workspace.singularity import distance_to_singularity
 from trirail.workspace.violations import violations
+from trirail.workspace.workspace import permitted_slice
 from trirail_drivers.config import Can, Drive, ObjectWrite
 from trirail_drivers.errors import MAX_MESSAGE_LENGTH, BusError, DriveError
 from trirail_drivers.interface import Triple
@@ -738,6 +739,90 @@ def test_no_permitted_pose_is_on_the_other_side_of_a_singular_pose(
     assert regular or "singular" in said
     if "a singular pose" in said:
         assert not regular
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        (
+            "sim.toml",
+            "position = [-0.17,",
+            "position = [0.3,",
+            "slider . is outside limits.slider.position .* by 0.3 m",
+        ),
+        ("sim.toml", "passive = [-0.17,", "passive = [0.3,", "cross slide . is outside limits.slider.passive"),
+        ("sim.toml", "x = [-0.15, 0.15]", "x = [2.0, 2.9]", "2, y = 0, phi = 0, slider . is outside"),
+        (
+            "uvw.toml",
+            "edge_point = [-0.0575, 0.0575]",
+            "edge_point = [0.0575, 0.0575]",
+            r"cross slide W is outside limits.slider.passive = \[-0.018, 0.018\] by 0.097 m; correct \[geometry\]",
+        ),
+    ],
+)
+def test_limits_without_any_pose_are_refused(name: str, old: str, new: str, message: str) -> None:
+    text = SIM.with_name(name).read_text(encoding="utf-8")
+    assert old in text
+    with pytest.raises(ConfigError, match=f"^limits: no pose is within all of them; at x = .*{message}"):
+        parse(text.replace(old, new))
+
+
+SHARES = st.tuples(st.floats(-1.0, 1.0), st.floats(0.01, 2.0))
+"""Middle and width of a range, in multiples of the configured width."""
+
+
+@pytest.mark.parametrize("name", ["sim.toml", "uvw.toml", "uvw-ppr.toml", "xxy.toml"])
+@example(position=(0.1, 0.3), passive=(-0.08, 0.3), x=(0.0, 1.0), y=(0.0, 1.0), phi=(0.0, 1.0))
+@given(position=SHARES, passive=SHARES, x=SHARES, y=SHARES, phi=SHARES)
+def test_limits_are_refused_exactly_if_no_pose_is_within_them(
+    name: str,
+    position: tuple[float, float],
+    passive: tuple[float, float],
+    x: tuple[float, float],
+    y: tuple[float, float],
+    phi: tuple[float, float],
+) -> None:
+    config = load(SIM.with_name(name))
+    slider, platform = config.limits.slider, config.limits.platform
+
+    def limited(extra: float) -> Config:
+        """Return the configuration with travels of the joints that are longer by a share `extra` at each end."""
+
+        def moved(ends: tuple[float, float], share: tuple[float, float], more: float) -> tuple[float, float]:
+            low, high = ends
+            middle, half = (low + high) / 2.0 + share[0] * (high - low), (share[1] / 2.0 + more) * (high - low)
+            return middle - half, middle + half
+
+        sliders = msgspec.structs.replace(
+            slider,
+            position=tuple(moved(ends, position, extra) for ends in slider.positions),
+            passive=moved(slider.passive, passive, extra),
+        )
+        window = msgspec.structs.replace(
+            platform,
+            x=moved(platform.x, x, 0.0),
+            y=moved(platform.y, y, 0.0),
+            phi=moved(platform.phi, (phi[0] / 3.0, phi[1] / 2.0), 0.0),
+        )
+        limits = msgspec.structs.replace(config.limits, slider=sliders, platform=window)
+        return msgspec.structs.replace(config, limits=limits, poses={})
+
+    tried = limited(0.0)
+    said = ""
+    try:
+        check(tried)
+    except ConfigError as error:
+        said = str(error)
+    assume("phi" not in said or "no pose" in said)
+
+    def anything(config: Config) -> bool:
+        robot, limits = geometry(config.geometry), config.limits
+        return any(len(permitted_slice(robot, limits, turn)) for turn in np.linspace(*limits.platform.phi, 257))
+
+    if "no pose" in said:
+        assert not anything(tried)
+    else:
+        assert anything(limited(0.02))
 
 
 def test_the_tolerance_of_poses_is_that_of_plans() -> None:

@@ -16,9 +16,11 @@ from trirail.config.as_built import AsBuilt
 from trirail.config.digital import digital_rules, named_io
 from trirail.config.explained import Mistake, overlap
 from trirail.config.network_checks import network_rules
-from trirail.config.tables import BASE, PLATFORM, Config, Limits, corrected_geometry, geometry, room
+from trirail.config.tables import BASE, PLATFORM, Config, Limits, Range, corrected_geometry, geometry, room
 from trirail.errors import ConfigError
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry, det_j2, gains, singular_angles, travels
+from trirail.kinematics.slices import clip, joint_rows
 from trirail.quantities import FAMILIAR_UNITS, as_familiar_unit
 from trirail.wire.text import QUANTITY_RULE, is_quantity
 
@@ -35,6 +37,10 @@ MAX_RANGE_SIZES = 10.0
 MM = FAMILIAR_UNITS["m"][0]
 ROUNDING = 1e-9
 """Distance by which a pose may exceed a limit because of rounding [m, rad], as in plans (motion.paths.ROUNDING)."""
+PHI_INTERVALS = 64
+"""Number of intervals of phi in which a permitted pose is searched. Each of them is bisected if necessary."""
+MIN_PHI_INTERVAL = 1e-6
+"""Width at which an interval of phi is no longer bisected [rad]."""
 _WINDOWS = (
     *((f"sliders[{i}]", "m") for i in range(3)),
     *((f"pose[{i}]", unit) for i, unit in enumerate(("m", "m", "rad"))),
@@ -96,6 +102,7 @@ def rules(config: Config) -> Iterator[Rule]:
     yield Rule("correction.backlash", ("limits.slider.position",), partial(_check_backlash, config))
     reads = "limits.platform.x", "limits.platform.y", "limits.singularity_margin", "geometry", "correction"
     yield Rule("limits.platform.phi", reads, partial(_check_singular_angles, config))
+    yield Rule("limits", ("geometry", "correction"), partial(_check_some_pose, config))
     yield from network_rules(config)
     settling = "limits.in_position.timeout", ("limits.in_position.dwell",)
     yield Rule(*settling, partial(_check_settling, config))
@@ -188,6 +195,64 @@ def _check_singular_angles(config: Config) -> None:
     )
 
 
+def _check_some_pose(config: Config) -> None:
+    """Refuse limits within which there is no pose.
+
+    The pose (0, 0, 0) need not be permitted. The pose nearest to it within limits.platform is tried first.
+    """
+    robot, box = corrected_geometry(config), room(config.limits)
+    low, high = np.array(box.low), np.array(box.high)
+    nearest = np.clip(0.0, low, high).tolist()
+    joints = _joints(config, nearest)
+    excess, joint, key, ends = max(
+        (max(ends[0] - at, at - ends[1]), joint, key, ends) for joint, at, key, ends in joints
+    )
+    if excess <= ROUNDING:
+        return
+    _check_singular_angles(config)  # beyond a singular angle, the positions of the joints need not be finite
+    if robot.correction is not None:
+        low, high = low - robot.correction.bound, high + robot.correction.bound
+    (left, bottom, first), (right, top, last) = low.tolist(), high.tolist()
+    centres = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
+    angles = np.linspace(first, last, PHI_INTERVALS + 1).tolist()
+    if any(_has_pose(config, centres, *both) for both in itertools.pairwise(angles)):
+        return
+    raise ConfigError(
+        f"limits: no pose is within all of them; at x = {nearest[0]:g}, y = {nearest[1]:g}, phi = {nearest[2]:g}, "
+        f"{joint} is outside {key} = [{ends[0]:g}, {ends[1]:g}] by {excess:.3g} m; correct [geometry] or [limits]"
+    )
+
+
+def _has_pose(config: Config, centres: Array, low: float, high: float) -> bool:
+    """Return whether a pose with its centre in a polygon (V, 2) [m] and phi between two angles is within the travels.
+
+    The interval is bisected, except if its middle has such a pose, or if it has none even with travels that are longer
+    by the distance by which each joint moves between the middle and an end of the interval. An interval that is still
+    undecided when it is narrower than MIN_PHI_INTERVAL counts as one with a pose.
+    """
+    robot, slider, middle = geometry(config.geometry), config.limits.slider, (low + high) / 2.0
+    rows = joint_rows(robot, middle)
+    joints = np.concatenate(
+        travels(robot, [[(*centre, phi) for centre in centres] for phi in (middle, low, high)]), axis=-1
+    )
+    moved = np.abs(joints[1:] - joints[0]).max(axis=(0, 1))
+    least, most = np.transpose([*slider.positions, *[slider.passive] * 3])
+    unit = np.array([1.0, 0.0, 0.0])
+
+    def slice_at_middle(longer: Array) -> Array:
+        inside = rows - np.outer(least - longer, unit), np.outer(most + longer, unit) - rows
+        return clip(centres, np.concatenate(inside))
+
+    if not len(slice_at_middle(moved + ROUNDING)):
+        return False
+    return (
+        high - low < MIN_PHI_INTERVAL
+        or len(slice_at_middle(np.full(6, ROUNDING))) > 0
+        or _has_pose(config, centres, low, middle)
+        or _has_pose(config, centres, middle, high)
+    )
+
+
 def _check_settling(config: Config) -> None:
     settling = config.limits.in_position
     if settling.timeout <= settling.dwell:
@@ -262,7 +327,7 @@ def _check_backlash(config: Config) -> None:
 
 def _check_pose(config: Config, name: str) -> None:
     """Refuse a named pose that is outside the limits, or closer to the end of a slider's travel than a plan may be."""
-    platform, slider, pose = config.limits.platform, config.limits.slider, config.poses[name]
+    platform, pose = config.limits.platform, config.poses[name]
     reserve = max(config.correction.backlash) / 2.0
     if is_quantity(name):
         raise ConfigError(f"poses.{name}: {name} {QUANTITY_RULE}")
@@ -270,17 +335,7 @@ def _check_pose(config: Config, name: str) -> None:
         (key, at, f"limits.platform.{key}", getattr(platform, key))
         for key, at in zip(("x", "y", "phi"), pose, strict=True)
     ]
-    robot = corrected_geometry(config)
-    position, passive = travels(robot, pose).tolist()
-    places += [
-        (f"slider {label}", at, key, ends)
-        for label, at, key, ends in zip(robot.labels, position, slider.keys("position"), slider.positions, strict=True)
-    ]
-    places += [
-        (f"cross slide {label}", at, "limits.slider.passive", slider.passive)
-        for label, at in zip(robot.labels, passive, strict=True)
-    ]
-    for coordinate, at, key, (low, high) in places:
+    for coordinate, at, key, (low, high) in places + _joints(config, pose):
         numbers = ", ".join(f"{value:g}" for value in pose)
         if not low - ROUNDING <= at <= high + ROUNDING:
             raise ConfigError(
@@ -292,3 +347,17 @@ def _check_pose(config: Config, name: str) -> None:
                 f"poses.{name} = [{numbers}]: {coordinate} would be {at:.6g}, closer than {less:g} m to an end of "
                 f"{key} = [{low:g}, {high:g}]; half of the widest correction.backlash is kept free there"
             )
+
+
+def _joints(config: Config, pose: Sequence[float]) -> list[tuple[str, float, str, Range]]:
+    """Return the name of each slider and cross slide, its position at a pose, and key and ends of its travel [m]."""
+    robot, slider = corrected_geometry(config), config.limits.slider
+    position, passive = travels(robot, pose).tolist()
+    keys = zip(robot.labels, position, slider.keys("position"), slider.positions, strict=True)
+    return [
+        *((f"slider {label}", at, key, ends) for label, at, key, ends in keys),
+        *(
+            (f"cross slide {label}", at, "limits.slider.passive", slider.passive)
+            for label, at in zip(robot.labels, passive, strict=True)
+        ),
+    ]

@@ -1,8 +1,7 @@
 """Workspace: the exact polygon of the possible centres G at an angle phi, and the extent and volume over all phi.
 
 At a fixed phi, the positions of the joints and det J2 are linear in x and y. Each limit therefore defines a half-plane,
-and the intersection of all half-planes is a convex polygon. A half-plane is described by a row r with r @ (1, x, y) >=
-0. A polygon is an array of vertices (V, 2) [m] in anticlockwise order; an empty polygon has the shape (0, 2).
+and the intersection of all half-planes is a convex polygon, as described in trirail.kinematics.slices.
 """
 
 from __future__ import annotations
@@ -17,12 +16,11 @@ from trirail.config import Limits, Range
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry, travels
+from trirail.kinematics.slices import EMPTY_POLYGON, clip, joint_rows
 from trirail.workspace.aspect import det_j2_rows, phi_range
 
 __all__ = ["Extent", "measure_extent", "permitted_slice", "polygon_area", "reachable_slice"]
 
-EMPTY_POLYGON = np.empty((0, 2))
-EDGE_TOLERANCE_M = 1e-13  # a vertex that is closer to the edge of a half-plane counts as on the edge
 MARGIN_SAMPLES = np.linspace(-1.0, 1.0, 129)  # angles at which det J2 is sampled, in multiples of the margin
 WALL_CLEARANCE_RAD = 1e-4  # closer to a wall, the sign of det J2 is not reliable because of rounding
 PHI_SLICES = 721  # number of slices for the integral over phi
@@ -59,13 +57,13 @@ def reachable_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
     margin = limits.singularity_margin
     if not low + margin <= phi <= high - margin:
         return EMPTY_POLYGON
-    polygon = _within_travels(_joint_rows(geometry, phi), limits)
+    polygon = _within_travels(joint_rows(geometry, phi), limits)
     if geometry.correction is not None and len(polygon):
         polygon = _within_travels(_corrected_rows(geometry, phi, polygon), limits)
     # if det J2 were always monotonic, the two ends of the margin would be sufficient
     turned = np.clip(phi + margin * MARGIN_SAMPLES, low + WALL_CLEARANCE_RAD, high - WALL_CLEARANCE_RAD)
     sign = np.sign(det_j2_rows(geometry, np.zeros(1))[0, 0])
-    return _clip(polygon, sign * det_j2_rows(geometry, turned))
+    return clip(polygon, sign * det_j2_rows(geometry, turned))
 
 
 def permitted_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
@@ -75,7 +73,7 @@ def permitted_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
         return EMPTY_POLYGON
     (left, right), (bottom, top) = window.x, window.y
     sides = np.array([[-left, 1.0, 0.0], [right, -1.0, 0.0], [-bottom, 0.0, 1.0], [top, 0.0, -1.0]])
-    return _clip(reachable_slice(geometry, limits, phi), sides)
+    return clip(reachable_slice(geometry, limits, phi), sides)
 
 
 def polygon_area(polygon: Array) -> float:
@@ -134,18 +132,8 @@ def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geomet
     )
 
 
-def _joint_rows(geometry: Geometry, phi: float) -> Array:
-    """Return rows (6, 3) with position = row @ (1, x, y) [m] for the sliders A, B, C, then for the cross slides.
-
-    As-built errors are left out.
-    """
-    x, y, angles = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), np.full(3, phi)
-    at_zero, *beside = np.stack([leg.travels(x, y, angles) for leg in geometry.each], axis=-1).swapaxes(0, 1)
-    return np.stack([at_zero, *(there - at_zero for there in beside)], axis=-1).reshape(6, 3)
-
-
 def _corrected_rows(geometry: Geometry, phi: float, polygon: Array) -> Array:
-    """Return the rows of `_joint_rows` with as-built errors: the best fit along the edges of a polygon (V, 2) [m]."""
+    """Return the rows of `joint_rows` with as-built errors: the best fit along the edges of a polygon (V, 2) [m]."""
     centres = np.concatenate([polygon, (polygon + np.roll(polygon, -1, axis=0)) / 2.0])
     positions = travels(geometry, np.column_stack([centres, np.full(len(centres), phi)])).swapaxes(0, 1)
     known = np.column_stack([np.ones(len(centres)), centres])
@@ -159,8 +147,8 @@ def _within_travels(joints: Array, limits: Limits) -> Array:
     least, most = np.array([*positions, passive, passive, passive]).T
     polygon = _parallelogram(joints[[0, 3]], positions[0], passive)
     unit = np.array([1.0, 0.0, 0.0])
-    polygon = _clip(polygon, joints - np.outer(least, unit))
-    return _clip(polygon, np.outer(most, unit) - joints)
+    polygon = clip(polygon, joints - np.outer(least, unit))
+    return clip(polygon, np.outer(most, unit) - joints)
 
 
 def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:
@@ -169,25 +157,6 @@ def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:
     ends = np.array([[low, inner], [high, inner], [high, outer], [low, outer]])
     corners = np.asarray(np.linalg.solve(joints[:, 1:], (ends - joints[:, 0]).T).T, dtype=np.float64)
     return corners if np.linalg.det(joints[:, 1:]) > 0.0 else corners[::-1]
-
-
-def _clip(polygon: Array, half_planes: Array) -> Array:
-    """Return the part of a convex polygon that is inside all half-planes (K, 3)."""
-    values = half_planes[:, 0] + polygon @ half_planes[:, 1:].T
-    for offset, *slope in half_planes[(values < -EDGE_TOLERANCE_M).any(axis=0)]:  # most half-planes have no effect
-        inside = offset + polygon @ slope
-        inside[np.abs(inside) < EDGE_TOLERANCE_M] = 0.0
-        if not (inside > 0.0).any():
-            return EMPTY_POLYGON
-        vertices = []
-        following = np.arange(1, len(polygon) + 1) % len(polygon)
-        for p, q, of_p, of_q in zip(polygon, polygon[following], inside, inside[following], strict=True):
-            if of_p >= 0.0:
-                vertices.append(p)
-            if of_p * of_q < 0.0:
-                vertices.append(p + of_p / (of_p - of_q) * (q - p))
-        polygon = np.array(vertices)
-    return polygon
 
 
 def _last_nonempty_phi(slice_at: Callable[[float], Array], nonempty: float, empty: float) -> float:
