@@ -289,6 +289,26 @@ def test_the_gate_knows_jerk_by_what_each_row_tells(leg: int, sign: float) -> No
     assert at_the_gate(rows(leg, acceleration=math.nan), STANDS) is not None
 
 
+@example(changes=[(0.0, 1.0)])
+@example(changes=[(0.5, 1.0)])
+@example(changes=[(0.0, 0.5), (1.0, -0.5)])
+@given(changes=st.lists(st.tuples(st.floats(0.0, 1.0), st.floats(-1.0, 1.0)), min_size=1, max_size=8))
+def test_the_gate_lets_through_every_motion_whose_acceleration_changes_by_the_jerk_of_a_cycle(
+    changes: list[tuple[float, float]],
+) -> None:
+    """Each change of the acceleration is a jump: its time within the cycle, and its share of all changes."""
+    all_changes = max(1.0, sum(abs(share) for _, share in changes))
+    position = velocity = acceleration = 0.0
+    for time, share in changes:
+        rest_of_cycle = (1.0 - time) * PERIOD
+        jump = share / all_changes * SLIDER.jerks[0] * PERIOD
+        position += jump * rest_of_cycle**2 / 2.0
+        velocity += jump * rest_of_cycle
+        acceleration += jump
+    now = rows(0, position=position, velocity=velocity, acceleration=acceleration)
+    assert at_the_gate(now, STANDS) is None
+
+
 @pytest.mark.parametrize("n", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_gate_knows_the_platforms_velocity_acceleration_and_jerk(n: int, sign: float) -> None:

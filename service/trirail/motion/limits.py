@@ -119,11 +119,13 @@ def _store_violation(check: int, n: int, value: float, limit: float, violation: 
 
 @compiled()
 def _least_jerk(now: Array, before: Array, n: int, period: float) -> float:
-    """Return the smallest jerk with which the motion of one cycle can lead from state `before` to state `now`.
+    """Return a lower bound of the jerk with which the motion of one cycle leads from state `before` to state `now`.
 
-    The jerk may switch between ±j at any time within the cycle T. The acceleration then changes by at most j T, the
-    change of velocity differs by at most j T² / 2 from the mean acceleration times T, and the change of position
-    differs by at most j T³ / 4 from the mean velocity times T.
+    The acceleration may change continuously or in a jump, as at the ends of some paths, but by at most j T in total
+    within the cycle T. The change of velocity then differs by at most j T² / 2 from the mean acceleration times T, and
+    the change of position by less than j T³ / 4 from the mean velocity times T. Without jumps, the bounds are
+    j T² / 4 and j T³ / 12, and the result can be half of the jerk. The tighter bounds would refuse paths that begin or
+    end with an acceleration.
     """
     half = period / 2.0
     p, v, a = now[0, n], now[1, n], now[2, n]
