@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
 from control_rig import CONFIG, ControlRig, expected_duration
+from hypothesis import example, given
+from hypothesis import strategies as st
 from motion.test_motion import only_from_rest
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker
@@ -131,6 +134,30 @@ def test_a_jog_holds_its_velocity_for_as_long_as_it_may_last_at_the_greatest_ove
     path = goals.plan(jog, Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 1.0, 3).run.path
     held = np.abs(path.pieces[:, 0, 1] - 0.02) + np.abs(path.pieces[:, 0, 2:]).sum(axis=1) < 1e-9
     assert np.diff(path.knots)[held].sum() == pytest.approx(1.0, abs=1e-6)
+
+
+@example(kind=0, sign=1.0, magnitude=-6.0, share=1.0)
+@example(kind=0, sign=1.0, magnitude=math.log10(5e-3), share=1.0)
+@example(kind=0, sign=1.0, magnitude=-3.0, share=0.1)
+@given(
+    kind=st.integers(0, 2),
+    sign=st.sampled_from([1.0, -1.0]),
+    magnitude=st.floats(-8.0, -2.3),
+    share=st.sampled_from([1.0, 0.1, 0.03]) | st.floats(0.03, 1.0),
+)
+def test_a_jog_towards_a_limit_ends_at_the_limit_however_near_it_is(
+    kind: int, sign: float, magnitude: float, share: float
+) -> None:
+    """The limit is 10**magnitude [m, rad] away: the jog is not refused, and has time to reach it."""
+    platform, axis = CONFIG.limits.platform, np.eye(3)[kind]
+    # 48 mm and 0.1 rad: the sliders permit x, y and phi there
+    box = msgspec.structs.replace(platform, x=(-0.048, 0.048), y=(-0.048, 0.048), phi=(-0.1, 0.1))
+    goals = GoalPlanner(ROBOT, msgspec.structs.replace(CONFIG.limits, platform=box), PERIOD)
+    limit = sign * (0.048, 0.048, 0.1)[kind]
+    begin = axis * (limit - sign * 10.0**magnitude)
+    x, y, phi = (sign * share * platform.velocity[kind] * axis).tolist()
+    plan = goals.plan(VelocityGoal(x, y, phi, timeout=2.0), Schedule(rest(begin.tolist()), PERIOD), 1.0, 3)
+    assert plan.run.path.end == pytest.approx(axis * limit, abs=5e-9)
 
 
 # What plans make use of, of the platform's limits along x.

@@ -14,7 +14,7 @@ from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.feasibility import ROUNDING_FACTOR, Checker, SampleResult, most_exceeded, slowdown_factor
 from trirail.motion.limits import COORDINATES, UNITS, Bounds
-from trirail.motion.paths import ROUNDING, Path, constant_law
+from trirail.motion.paths import ROUNDING, Path, constant_law, evaluate_path
 from trirail.motion.quintic import Point, check_ends, quintic
 from trirail.motion.ruckig_call import Kinodynamic, Solver
 from trirail.motion.runs import (
@@ -47,6 +47,8 @@ LIMIT_UTILISATION = 0.97
 MAX_JOG_PLANS = 12
 """Greatest number of plans for a jog. Each plan is slower, shorter, or has softer ramps than the previous plan. If no
 plan fits, a robot at rest refuses the jog, and a moving robot brakes."""
+MAX_JOG_SHARE = 0.9
+"""Greatest factor on the velocity of a jog from rest, if its ramps do not fit before a limit."""
 MAX_PATH_RATE = 2.0
 """Highest rate of the time along a path. It corresponds to an override of 200 %."""
 RATE_UNITS = "/s", "/s²", "/s³"
@@ -230,10 +232,9 @@ class PathPlanner:
         RefusedError
             The robot would not move, or even braking would leave the workspace.
         """
-        share, slower, softer, hold, bound = 1.0, 1.0, 1.0, MAX_PATH_RATE * timeout, None
-        for value, limit in zip(velocity, self.platform.velocity, strict=True):
-            if abs(value) * share > limit:
-                share = limit / abs(value)
+        slower, softer, hold, bound = 1.0, 1.0, MAX_PATH_RATE * timeout, None
+        highest = zip(velocity, self.platform.velocity, strict=True)
+        share = min([1.0, *(limit / abs(value) for value, limit in highest if value)])
         for _ in range(MAX_JOG_PLANS):
             asked = [share / slower * value for value in velocity]
             limits = _scaled_limits(self.platform, slower, softer)
@@ -251,11 +252,19 @@ class PathPlanner:
                     slower *= result.slowdown_factor / LIMIT_UTILISATION
                 continue
             bound = self.checker.bound(path, result.leaves_at, start.pose)
-            if hold > 0.0:
-                # Shorten the constant part, so that the robot is at rest when the last plan left the workspace.
-                hold = max(0.0, result.leaves_at - ramp - brake)
-            else:
-                share /= 2.0
+            if not any(velocity):
+                break
+            possible, planned = _distances(path, result.leaves_at, begin.pose, asked)
+            if start.at_rest and possible <= 0.0:
+                break
+            speed, constant = max(map(abs, asked)), path.duration - ramp - brake
+            # End the constant part earlier, so that the robot is at rest where the last plan left the workspace.
+            hold = constant - (planned - possible) / speed
+            if hold < self._period:
+                # The ramps alone are too long. From rest, their length falls at least with velocity^(3/2).
+                least = planned - (constant - self._period) * speed
+                share *= min(MAX_JOG_SHARE, (possible / least) ** (2.0 / 3.0)) if start.at_rest else 0.5
+                hold = MAX_PATH_RATE * timeout
         if start.at_rest and any(velocity):
             raise _jog_refusal(bound, result)
         path = self._solver.to_velocity(tool_motion(start, tool), ZERO_RATES, self.platform, tool)
@@ -396,6 +405,18 @@ class PathPlanner:
         brake = self._solver.to_velocity_straight(MotionState(end, velocity, ZERO_RATES), ZERO_RATES, limits, tool)
         whole = joined([ramp, Path(np.array([0.0, hold]), held, tools=repeat_tool(tool, 1)), brake])
         return ramp.duration, brake.duration, whole
+
+
+def _distances(path: Path, time: float, begin: Sequence[float], velocity: Sequence[float]) -> tuple[float, float]:
+    """Return how far a jog goes until a time [s], less ROUNDING, and until its end, from `begin` along its velocity.
+
+    The distances are those of the coordinate with the highest velocity [m, rad].
+    """
+    motion = np.zeros((3, 3))
+    evaluate_path(path.knots, path.pieces, time, motion)
+    along = np.array(velocity) / max(map(abs, velocity))
+    along /= along @ along
+    return float((motion[0] - begin) @ along) - ROUNDING, float((path.end - begin) @ along)
 
 
 def _jog_refusal(bound: str | None, result: SampleResult) -> RefusedError:
