@@ -7,16 +7,17 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from trirail.config import SIM, Limits, load
+from trirail.config import SIM, Limits, corrected_geometry, load
 from trirail.errors import KinematicsError
 from trirail.kinematics.correction import Correction
 from trirail.kinematics.geometry import Geometry, Leg, singular_angles
 from trirail.kinematics.robot import inverse, jacobians
 from trirail.workspace.aspect import phi_range
+from trirail.workspace.reach import ANGLE_STEP_RAD, Reach
 from trirail.workspace.singularity import (
     characteristic_length,
     conditioning,
@@ -406,3 +407,27 @@ def test_the_volume_by_chance(robot: Geometry) -> None:
 def test_limits_that_leave_nothing_are_refused() -> None:
     with pytest.raises(KinematicsError, match="no pose is within the limits"):
         measure_extent(PAPER, limited((0.2, 0.3), (-0.3, -0.2)), reachable_slice)
+
+
+@pytest.mark.parametrize("name", ["sim.toml", "uvw.toml", "uvw-ppr.toml", "xxy.toml", "socketcan.toml"])
+@example(low=0.0, width=1.0, place=0.0, beyond=1e-6)
+@example(low=0.5, width=1e-3, place=0.5, beyond=1e-6)
+@given(low=st.floats(0.0, 0.9), width=st.floats(1e-4, 1.0), place=st.floats(0.0, 1.0), beyond=st.floats(1e-6, 0.1))
+def test_the_workspace_has_an_outline_exactly_where_phi_is_permitted(
+    name: str, low: float, width: float, place: float, beyond: float
+) -> None:
+    """The limits of φ are a part of the configured range: `low` and `width` are shares of that range."""
+    config = load(SIM.with_name(name))
+    robot, limits = corrected_geometry(config), config.limits
+    first, last = limits.platform.phi
+    begin = first + low * (last - first)
+    end = begin + min(width, 1.0 - low) * (last - first)
+    platform = msgspec.structs.replace(limits.platform, phi=(begin, end))
+    limits = msgspec.structs.replace(limits, platform=platform)
+    reach, tolerance = Reach(robot, limits), limits.in_position.pose[2]
+    angles = np.array([begin + place * (end - begin), begin - tolerance - beyond, end + tolerance + beyond])
+    inside, below, above = (len(reach.outline(step)) > 0 for step in reach.outline_indices(angles))
+    assert (below, above) == (False, False)
+    near = np.clip(angles[0] + ANGLE_STEP_RAD * np.linspace(-0.5, 0.5, 5), begin, end)
+    permitted = {len(permitted_slice(robot, limits, phi)) > 0 for phi in near.tolist()}
+    assert inside in permitted

@@ -10,7 +10,7 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from trirail.config import Limits
 from trirail.kinematics.geometry import Geometry, singular_angles
@@ -28,9 +28,11 @@ class Reach:
     """Cache of workspace outlines and singular angles of one robot."""
 
     def __init__(self, geometry: Geometry, limits: Limits) -> None:
-        self.outline = lru_cache(_CACHE_SIZE)(lambda step: _closed_outline(geometry, limits, int(step)))
-        """Closed outline of the permitted centres at φ = `step` * ANGLE_STEP_RAD, shape (V + 1, 2) [m]. It is empty if
-        no centre is permitted."""
+        self._phi, self._tolerance = limits.platform.phi, limits.in_position.pose[2]
+        self._first, self._last = map(_step, self._phi)
+        self.outline = lru_cache(_CACHE_SIZE)(lambda step: _closed_outline(geometry, limits, self._angle(int(step))))
+        """Closed outline of the permitted centres at a step of φ, from `outline_indices`, shape (V + 1, 2) [m]. It is
+        empty if no centre is permitted."""
         self._singular = lru_cache(_CACHE_SIZE)(
             lambda x, y: np.array(singular_angles(geometry, (x * CENTRE_STEP_M, y * CENTRE_STEP_M)))[:, np.newaxis]
         )
@@ -41,8 +43,20 @@ class Reach:
         )
 
     def outline_indices(self, phi: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the argument `step` of `outline` for each of the given angles [rad]."""
-        return np.rint(phi / ANGLE_STEP_RAD).astype(np.int64)
+        """Return the argument `step` of `outline` for each of the given angles [rad].
+
+        An angle beyond its limit by more than the in-position window never has a step that contains the limit.
+        """
+        low, high = self._phi
+        steps = _step(phi)
+        steps = np.where(phi < low - self._tolerance, np.minimum(steps, self._first - 1), steps)
+        return np.where(phi > high + self._tolerance, np.maximum(steps, self._last + 1), steps)
+
+    def _angle(self, step: int) -> float:
+        """Return the permitted angle nearest to the middle of a step [rad], or the middle if none is permitted."""
+        low, high = self._phi
+        middle = step * ANGLE_STEP_RAD
+        return min(max(middle, low), high) if self._first <= step <= self._last else middle
 
     def singularity_distance(self, poses: Points) -> NDArray[np.float64]:
         """Return the distance of φ from the nearest singular angle [rad], (N,), for poses (N, 3)."""
@@ -62,6 +76,10 @@ def _least_angle(phi: NDArray[np.float64], singular: NDArray[np.float64]) -> NDA
     return least
 
 
-def _closed_outline(geometry: Geometry, limits: Limits, step: int) -> Points:
-    polygon = permitted_slice(geometry, limits, step * ANGLE_STEP_RAD)
+def _step(phi: ArrayLike) -> NDArray[np.int64]:
+    return np.rint(np.asarray(phi) / ANGLE_STEP_RAD).astype(np.int64)
+
+
+def _closed_outline(geometry: Geometry, limits: Limits, phi: float) -> Points:
+    polygon = permitted_slice(geometry, limits, phi)
     return np.concatenate([polygon, polygon[:1]])
