@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 
+import msgspec
 import numpy as np
 import pytest
 from control.test_control import PERIOD, ROBOT, assert_within_limits
@@ -12,12 +13,14 @@ from control_rig import CONFIG, ControlRig, expected_duration
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from refusals import refusal
+from trirail.errors import RefusedError
 from trirail.motion.feasibility import Checker, slowdown_factor
 from trirail.motion.limits import Bounds
 from trirail.motion.path_planner import PathPlanner
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.runs import rest, stretched
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
+from trirail.wire.kinds.trajectory import MAX_DURATION_S
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
 
@@ -161,6 +164,28 @@ def test_one_with_accelerations_at_rest_is_stretched_until_it_fits(
     if plan.reply.slowed > 1.01:
         quicker = stretched(plan.path, 1.0 / 1.01)
         assert slowdown_factor(checker.worst_shares(quicker, STILL)) > 1.0
+
+
+@example(magnitude=-5.0, seconds=1e-3, stretch=True)
+@example(magnitude=-6.0, seconds=1.0, stretch=False)
+@given(magnitude=st.floats(-8.0, -5.7) | st.floats(-5.6, -4.0), seconds=st.floats(1e-3, 10.0), stretch=st.booleans())
+def test_no_trajectory_is_stretched_beyond_the_longest_duration(
+    magnitude: float, seconds: float, stretch: bool
+) -> None:
+    """The platform may move by 10**magnitude [m/s]: along 0.1 m, it takes a day at 10**-5.66."""
+    platform = msgspec.structs.replace(CONFIG.limits.platform, velocity=(10.0**magnitude,) * 3)
+    limits = msgspec.structs.replace(CONFIG.limits, platform=platform)
+    bounds = Bounds(limits, PERIOD)
+    checker = Checker(ROBOT, limits, bounds, PERIOD)
+    planner = PathPlanner(ROBOT, platform, limits.slider, bounds, checker, PERIOD)
+    points = [Point(0.0, STILL, STILL, STILL), Point(seconds, (0.1, 0.0, 0.0), STILL, STILL)]
+    shortest = 1.875 * 0.1 / 10.0**magnitude  # of a quintic from rest to rest
+    if shortest > MAX_DURATION_S:
+        with pytest.raises(RefusedError, match=r"would last .* s within its limits: the maximum is 86400 s") as refused:
+            planner.plan_trajectory(rest(STILL), points, stretch)
+        assert refused.value.limit == MAX_DURATION_S
+    elif stretch:
+        assert shortest <= planner.plan_trajectory(rest(STILL), points, stretch).path.duration <= MAX_DURATION_S
 
 
 BEFORE_A_WAIT = (

@@ -30,6 +30,7 @@ from trirail.motion.runs import (
 )
 from trirail.motion.straight_lines import time_optimal
 from trirail.quantities import apart, as_familiar_unit, beyond, worded
+from trirail.wire.kinds.trajectory import MAX_DURATION_S
 from trirail.wire.messages import GoalReply
 
 MIN_LIMIT_SHARE = 0.1
@@ -367,11 +368,19 @@ class PathPlanner:
         One slowdown may not be enough. A peak of the jerk that is shorter than a sampling step lasts longer in the
         slower path, and may only then be sampled. The jerk over a cycle also falls more slowly than with the third
         power of the factor if the path has an acceleration at an end, or if the path lasts only a few cycles. The
-        secant method then finds the power of the factor with which the path must be slowed.
+        secant method then finds the power of the factor with which the path must be slowed. Raises RefusedError if the
+        path does not fit, or would last longer than MAX_DURATION_S.
         """
         factors, left = [], []
         for check in range(MAX_SLOWDOWN_CHECKS):
             slow = stretched(path, factor)
+            if slow.duration > MAX_DURATION_S:
+                raise RefusedError(
+                    RefusalCode.TOO_FAST,
+                    f"the path would last {slow.duration:.3g} s within its limits: the maximum is {MAX_DURATION_S:g} s",
+                    value=slow.duration,
+                    limit=MAX_DURATION_S,
+                )
             factor_left = slowdown_factor(self.checker.worst_shares(slow, pose))
             if factor_left <= 1.0:
                 return slow, factor
