@@ -217,9 +217,10 @@ def _check_some_pose(config: Config) -> None:
     angles = np.linspace(first, last, PHI_INTERVALS + 1).tolist()
     if any(_has_pose(config, centres, *both) for both in itertools.pairwise(angles)):
         return
+    (x, y, phi), (least, most) = nearest, ends
     raise ConfigError(
-        f"limits: no pose is within all of them; at x = {nearest[0]:g}, y = {nearest[1]:g}, phi = {nearest[2]:g}, "
-        f"{joint} is outside {key} = [{ends[0]:g}, {ends[1]:g}] by {excess:.3g} m; correct [geometry] or [limits]"
+        f"limits: no pose is within all of them; at x = {x:g}, y = {y:g}, phi = {phi:g}, "
+        f"{joint} is outside {key} = [{least:g}, {most:g}] by {excess:.3g} m; correct [geometry] or [limits]"
     )
 
 
