@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
-from trirail.cli import live
+from trirail.cli import live, pendant, terminal
+from trirail.client import picture
+from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.processes.publications import info
 from trirail.wire.state import (
@@ -155,3 +158,47 @@ def test_a_position_that_is_not_homed_is_not_shown_as_measured(homed: tuple[bool
     assert ("not homed" in lines["measured"]) is not all(homed)
     for known, name in zip(homed, NAMES, strict=True):
         assert lines[f"slider {name}"].startswith("not homed") is not known
+
+
+HOMED = st.tuples(st.booleans(), st.booleans(), st.booleans())
+AT_LIMITS = Pose(LIMITS.platform.x[1], LIMITS.platform.y[0], LIMITS.platform.phi[1])
+
+
+def state_homed(homed: tuple[bool, bool, bool]) -> State:
+    """Return a state in which every measured value that is not homed would be near a limit."""
+    ends = [high if known else low for known, (low, high) in zip(homed, LIMITS.slider.positions, strict=True)]
+    a, b, c = ends
+    sliders = Sliders((a, b, c), REST, REST, REST, ("operation enabled",) * 3, (COUNTS,) * 3, homed)
+    return a_state(pose=AT_LIMITS, sliders=sliders, goal=GoalState("g-17", 0.25, 1.5, Pose(0.05, 0.0, 0.0)))
+
+
+class States:
+    """Robot that sends a single state."""
+
+    def __init__(self, state: State) -> None:
+        self.state = state
+
+    def states(self, _timeout: float) -> list[State]:
+        return [self.state]
+
+
+@given(HOMED)
+def test_a_pose_is_shown_only_if_all_sliders_are_homed(homed: tuple[bool, bool, bool]) -> None:
+    state = state_homed(homed)
+    with terminal.out.capture() as captured:
+        live._print_once_a_second(cast(Robot, States(state)))
+    shown = [
+        captured.get(),
+        picture.line("demo", state),
+        picture.html(info(load(SIM)), state).split("<svg")[0],
+        pendant._shown(cast(pendant.Pendant, SimpleNamespace(speed=REST, said="")), state).plain,
+    ]
+    for text in shown:
+        assert ("not homed" in text) is not all(homed)
+        assert (re.search(r"\bx +-?\d", text) is not None) is all(homed)
+    lines = printed(state)
+    assert ("to go" in lines) is all(homed)
+    near_names = {words.split(",")[0].rsplit(" ", 2)[0] for words in near(state)}
+    assert near_names >= {f"slider {name}" for name, known in zip(NAMES, homed, strict=True) if known}
+    assert near_names <= {"x", "y", "φ"} | {f"slider {n}" for n, known in zip(NAMES, homed, strict=True) if known}
+    assert ("x" in near_names) is all(homed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from cli.test_live import COUNTS, REST, a_state
@@ -51,6 +52,15 @@ def test_the_drawing_shows_carriages_and_platform_where_they_are(
     for x, y in circles:
         assert left <= x <= left + width
         assert top <= -y <= top + height
+
+
+@given(st.tuples(st.booleans(), st.booleans(), st.booleans()))
+def test_the_drawing_shows_carriages_and_platform_only_if_all_are_homed(homed: tuple[bool, bool, bool]) -> None:
+    state = at((0.01, 0.02, 0.0), SIM)
+    state = msgspec.structs.replace(state, sliders=msgspec.structs.replace(state.sliders, homed=homed))
+    drawn = ET.fromstring(picture.html(info(load(SIM)), state))
+    assert bool(list(drawn.iter(f"{SVG}circle"))) is all(homed)
+    assert list(drawn.iter(f"{SVG}polyline"))
 
 
 @given(st.text(max_size=20), st.text(min_size=1, max_size=20))

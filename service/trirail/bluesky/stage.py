@@ -29,6 +29,8 @@ COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
 UNNAMED = "stage"
 """Default name of a stage."""
+UNKNOWN = Pose(math.nan, math.nan, math.nan)
+"""Measured pose in a reading while a slider is not homed."""
 T = TypeVar("T", float, NDArray[np.float64])
 Keys = dict[str, DataKey]
 
@@ -145,9 +147,10 @@ class Stage(Monitored, AsyncReadable, HasHints):
 
     def readings(self, state: State) -> Readings:
         """Return all readings of a state."""
+        pose = state.measured_pose or UNKNOWN
         values: dict[str, Any] = {
-            **dict(zip((self.x.name, self.y.name, self.phi.name), state.pose, strict=True)),
-            self.pose.name: np.array(state.pose),
+            **dict(zip((self.x.name, self.y.name, self.phi.name), pose, strict=True)),
+            self.pose.name: np.array(pose),
             self.key("sliders"): np.array(state.sliders.position),
             self.key("following_error"): np.array(state.sliders.following_error),
             self.key("t"): state.t,
@@ -229,7 +232,7 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         The setpoint is the target of the goal in progress; if there is no goal, it is the commanded value.
         """
         state = await (await self._stage.link()).robot.state()
-        return Location(setpoint=self._value(setpoint_of(state)), readback=self._value(state.pose))
+        return Location(setpoint=self._value(setpoint_of(state)), readback=self._value(state.measured_pose or UNKNOWN))
 
     @WatchableAsyncStatus.wrap
     async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:

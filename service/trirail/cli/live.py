@@ -77,7 +77,7 @@ def _print_once_a_second(robot: Robot) -> None:
             due = time.monotonic() + 1.0
             goal = f"  goal {state.goal.id} {state.goal.progress:.0%}" if state.goal else ""
             faults = "".join(f"  {fault}" for fault in state.faults)
-            print_line(f"{state.t:.2f} s  {state.mode}  {notation.pose(state.pose)}{goal}{faults}")
+            print_line(f"{state.t:.2f} s  {state.mode}  {notation.measured_pose(state)}{goal}{faults}")
 
 
 @contextlib.contextmanager
@@ -132,8 +132,8 @@ def table(state: State, robot: str, labels: Labels, limits: Limits | None = None
         grid.add_row("lease", f"held by {plain(state.lease)}")
     if state.goal:
         _add_goal(grid, state, state.goal)
-    homed = all(state.sliders.homed)
-    grid.add_row("measured", notation.pose(state.pose, 9) if homed else "[yellow]unknown: not homed[/]")
+    colour = "yellow" if state.measured_pose is None else "default"
+    grid.add_row("measured", f"[{colour}]{notation.measured_pose(state, 9)}[/]")
     grid.add_row("commanded", notation.pose(state.commanded.pose, 9))
     _add_sliders(grid, state, labels)
     for words in near_limits(state, limits, labels) if limits else ():
@@ -156,16 +156,19 @@ def near_limits(state: State, limits: Limits, labels: Labels) -> Iterator[str]:
     """Yield a line for each measured position, commanded rate or following error that is near or beyond its limit."""
     slider, platform = limits.slider, limits.platform
     measured = zip(labels, state.sliders.position, slider.positions, state.sliders.following_error, strict=True)
-    for name, at, travel, error in measured:
-        yield from _position(f"slider {name}", at, travel, "mm", 3)
+    for (name, at, travel, error), homed in zip(measured, state.sliders.homed, strict=True):
+        if homed:
+            yield from _position(f"slider {name}", at, travel, "mm", 3)
         yield from _rate(f"following error of {name}", error, slider.following_error, "µm", 1)
     for name, rate, most in zip(labels, state.commanded.velocity, slider.velocities, strict=True):
         yield from _rate(f"velocity of slider {name}", rate, most, "mm/s", 2)
     ranges = (platform.x, platform.y, platform.phi)
-    for (name, unit, per_second, digits), at, rate, ends, most in zip(
-        _ALONG, state.pose, state.commanded.pose_velocity, ranges, platform.velocity, strict=True
+    pose = state.measured_pose or (None, None, None)
+    for (name, unit, per_second, digits), coordinate, rate, ends, most in zip(
+        _ALONG, pose, state.commanded.pose_velocity, ranges, platform.velocity, strict=True
     ):
-        yield from _position(name, at, ends, unit, digits)
+        if coordinate is not None:
+            yield from _position(name, coordinate, ends, unit, digits)
         yield from _rate(f"velocity of {name}", rate, most, per_second, 2)
 
 
@@ -196,7 +199,9 @@ def _add_goal(grid: Table, state: State, goal: GoalState) -> None:
         grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(state, goal)}")
     if goal.target is not None:
         grid.add_row("  target", notation.pose(goal.target, 9))
-        grid.add_row("  to go", notation.pose([end - at for end, at in zip(goal.target, state.pose, strict=True)], 9))
+        if (measured := state.measured_pose) is not None:
+            remaining = [end - at for end, at in zip(goal.target, measured, strict=True)]
+            grid.add_row("  to go", notation.pose(remaining, 9))
 
 
 def _add_sliders(grid: Table, state: State, labels: Labels) -> None:

@@ -15,7 +15,7 @@ from cyclopts import Parameter, Token
 
 from trirail.naming import Labels
 from trirail.wire.decoding import converted, prepare
-from trirail.wire.state import CorrectionInfo
+from trirail.wire.state import CorrectionInfo, State
 from trirail.wire.text import NAME_RULE, comma_hint, is_name, quoted
 from trirail.wire.units import (
     ACCELERATION,
@@ -56,6 +56,12 @@ def pose(values: Sequence[float], width: int = 0) -> str:
     """Format a pose [m, m, rad] on one line, with its numbers in columns of width `width`."""
     x, y, phi = values
     return f"x {written(x, 'mm', 3, width)}   y {written(y, 'mm', 3, width)}   φ {written(phi, '°', 4, width)}"
+
+
+def measured_pose(state: State, width: int = 0) -> str:
+    """Format the measured pose of a state as `pose` does, or say why it is unknown."""
+    measured = state.measured_pose
+    return "unknown: not homed" if measured is None else pose(measured, width)
 
 
 def correction(info: CorrectionInfo, labels: Labels) -> str:

@@ -20,7 +20,7 @@ from typing import Self
 from rich.live import Live
 from rich.text import Text
 
-from trirail.cli import live, terminal
+from trirail.cli import live, notation, terminal
 from trirail.client.client import Robot
 from trirail.client.goal import Velocity
 from trirail.client.held_jog import SPEEDS, USUAL, HeldJog
@@ -224,10 +224,9 @@ def _shown(pendant: Pendant, state: State | None) -> Text:
     x, _, phi = pendant.speed
     lines = ["no contact with the service" if state is None else f"{state.mode}, override {state.override:.0%}"]
     if state is not None:
-        at_x, at_y, at_phi = state.pose
         v_x, v_y, v_phi = state.velocity
         lines += [f"fault: {fault}" for fault in state.faults]
-        lines.append(f"x {at_x * 1e3:9.3f} mm   y {at_y * 1e3:9.3f} mm   φ {math.degrees(at_phi):9.4f}°")
+        lines.append(notation.measured_pose(state, 9))
         lines.append(f"  {v_x * 1e3:9.2f} mm/s   {v_y * 1e3:9.2f} mm/s   {math.degrees(v_phi):9.3f} °/s")
     lines.append(f"speed {x * 1e3:.3g} mm/s, {math.degrees(phi):.3g} °/s")
     lines.append(pendant.said)

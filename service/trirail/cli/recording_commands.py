@@ -111,7 +111,8 @@ def export(
 ) -> int:
     """Write a recorded session as a table, CSV, Parquet or numpy, or as MCAP.
 
-    The table has one row per cycle, in SI units. MCAP contains ROS 2 messages for Foxglove, PlotJuggler and ros2 bag.
+    The table has one row per cycle, in SI units. The measured pose is valid only in rows with all sliders homed.
+    MCAP contains ROS 2 messages for Foxglove, PlotJuggler and ros2 bag.
 
     Parameters
     ----------

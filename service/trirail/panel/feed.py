@@ -118,7 +118,7 @@ class Feed:
                     stamp = now()
                     content = msgspec.json.encode({"tell": "state", "stamp": stamp, "state": state})
                     with self.changed:
-                        self.state, self.stamp, self._pose = content, stamp, state.pose
+                        self.state, self.stamp, self._pose = content, stamp, state.measured_pose
                         self.changed.notify_all()
             is_new = True
             with self.changed:

@@ -195,8 +195,9 @@ def table(recording: Recording, columns: Sequence[str] = ()) -> pa.Table:
 
     The columns are t [s], wall (UTC), the name of the mode, and the other fields of wire.records.FIELDS. Columns of
     sliders end in _a, _b, _c, columns of poses in _x, _y, _phi, and columns of the parts of a cycle in the name of the
-    part. If `columns` is given, the table contains only t and the selected fields. A field is selected by its name or
-    by a word in its name, such as error or commanded. Raises ServiceError for an unknown column.
+    part. The position of a slider is valid only if the slider is homed, and the pose only if all sliders are. If
+    `columns` is given, the table contains only t and the selected fields. A field is selected by its name or by a word
+    in its name, such as error or commanded. Raises ServiceError for an unknown column.
     """
     fields = chosen(columns)
     table_columns: dict[str, pa.Array] = {"t": pa.array(recording.t)}

@@ -49,7 +49,7 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("homed", "B", 3),  # whether the absolute positions of A, B, C are known
     ("homing", "B", 1),  # whether the drives are being homed
     ("settled", "B", 1),  # whether the robot is in position according to [limits.in_position]
-    ("pose", "d", 3),  # measured pose x, y [m], phi [rad], from the forward kinematics of the measured sliders
+    ("pose", "d", 3),  # measured pose x, y [m], phi [rad], from the measured sliders; unknown unless all are homed
     ("commanded_pose", "d", 3),
     ("commanded_pose_velocity", "d", 3),
     ("commanded_pose_acceleration", "d", 3),

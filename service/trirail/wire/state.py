@@ -176,6 +176,11 @@ class State(Struct, frozen=True):
     inputs: dict[str, bool] = {}
     """Newest value of each input of the configuration."""
 
+    @property
+    def measured_pose(self) -> Pose | None:
+        """Measured pose; None if it is unknown, because a slider is not homed."""
+        return self.pose if all(self.sliders.homed) else None
+
 
 SUMMARY_BYTES = 300
 """Maximum size of a summary as JSON [bytes]."""
