@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from threading import Thread
 
 from trirail.cli.options import HERE, Service
 from trirail.cli.robot_commands import confirmed
-from trirail.errors import TrirailError
 from trirail.wire.vocabulary import Command
 
 
@@ -20,14 +20,21 @@ def stopping(name: Command) -> Callable[..., int]:
 
         asked = NewStop(name, service.robot, service.connect, service.tls)
         try:
-            reply = asked.wait()
-        except TrirailError:
-            asked.opening.join()
-            raise
-        confirmed(service, name, reply)
-        if asked.opening.is_alive():  # it may take seconds, and the interpreter cannot end while Zenoh's code runs
+            confirmed(service, name, asked.wait())
             sys.stdout.flush()
+        except BaseException:
+            _join(asked.opening)
+            raise
+        if asked.opening.is_alive():  # it may take seconds
             os._exit(0)
         return 0
 
     return stop
+
+
+def _join(opening: Thread) -> None:
+    """Wait for the thread, as the interpreter cannot end while Zenoh's code runs. Ctrl-C ends the process."""
+    try:
+        opening.join()
+    except KeyboardInterrupt:
+        os._exit(130)
