@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import itertools
 import json
 import os
 import shlex
@@ -26,8 +27,8 @@ from generated import thinned
 from hypothesis import example, given
 from hypothesis import strategies as st
 from trirail import __main__
-from trirail.cli import app, help_pages, live, notation, recording_commands, terminal, view
-from trirail.client import client, connection
+from trirail.cli import app, help_pages, live, notation, recording_commands, stop_commands, terminal, view
+from trirail.client import client, connection, new_stop
 from trirail.client.goal import Result
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
@@ -36,6 +37,7 @@ from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, 
 from trirail.wire.messages import GoalReply
 from trirail.wire.state import NamedPose
 from trirail.wire.text import json_printable
+from trirail.wire.vocabulary import Command
 from waiting import WITHIN
 
 Run = Callable[..., tuple[int, str, str]]
@@ -613,13 +615,93 @@ def test_watch_into_a_pipe_is_a_line_a_second(monkeypatch: pytest.MonkeyPatch) -
     class Moving(Slow):
         def states(self, timeout: float) -> Iterator[SimpleNamespace]:
             for number in range(24):
-                yield SimpleNamespace(t=number / 8, mode="moving", pose=position, goal=goal, faults=("a",))
+                yield SimpleNamespace(t=number / 8, mode="moving", measured_pose=position, goal=goal, faults=("a",))
                 at[0] += 1 / 8
 
     with pytest.raises(ServiceError, match="no longer sends its state"):
         live.watch(Moving(1.0), json_lines=False)  # type: ignore[arg-type]
     assert [line.split("   ")[0] for line in said] == [f"{t} s  moving  x 10.000 mm" for t in ("0.00", "1.00", "2.00")]
     assert said[0].endswith("goal g-1 40%  a")
+
+
+PRINTS: dict[str, Callable[[], object]] = {
+    "line": lambda: terminal.print_line("done"),
+    "table": lambda: terminal.out.print(terminal.table("name", "value")),
+    "error": lambda: terminal.print_error("slowed"),
+    "json": lambda: terminal.json({"ok": True}),
+    "text": lambda: terminal.write("text"),
+}
+
+
+def exit_code_in_closed_pipe(command: Callable[[], int]) -> int:
+    """Return the exit code of a command whose standard output is a pipe that its reader has closed."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with pytest.MonkeyPatch.context() as patched, open(writer, "w") as closed:
+        patched.setattr(app, "app", lambda *_, **__: command())
+        patched.setattr(sys, "argv", ["trirail", "goto", "0", "0", "0", "--json"])
+        patched.setattr(sys, "stdout", closed)
+        patched.setattr(terminal, "_reader_left", threading.Event())
+        with pytest.raises(SystemExit) as ended:
+            app.main()
+        closed.flush()  # as the interpreter does at its end; a failure would make its exit code 120
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+@given(st.lists(st.sampled_from(sorted(PRINTS)), min_size=1, max_size=4), st.sampled_from([0, 1, 130, "refused"]))
+def test_the_exit_code_is_that_of_the_command_whoever_closes_its_pipe(prints: list[str], outcome: int | str) -> None:
+    def command() -> int:
+        for name in prints:
+            PRINTS[name]()
+        if isinstance(outcome, str):
+            raise RefusedError(RefusalCode.BUSY, outcome)
+        return outcome
+
+    assert exit_code_in_closed_pipe(command) == (1 if isinstance(outcome, str) else outcome)
+
+
+@pytest.mark.parametrize("name", ["line", "json"])
+def test_an_endless_output_ends_with_its_reader(name: str) -> None:
+    def command() -> int:
+        for _ in terminal.until_reader_leaves(itertools.count()):
+            PRINTS[name]()
+        return 1
+
+    assert exit_code_in_closed_pipe(command) == 0
+
+
+@pytest.mark.parametrize("line", ["help all", "goto --help", "--version", "ik 0 0 0", "ik 0 0 0 --json"])
+def test_help_and_results_into_a_closed_pipe_are_no_failure(line: str) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "trirail", *line.split()], stdout=writer, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "full"), KeyboardInterrupt(), ServiceError("silent")])
+@pytest.mark.parametrize("where", ["wait", "print"])
+def test_a_stop_that_fails_waits_for_the_session_that_opens(
+    failure: BaseException, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The interpreter would abort if it ended while Zenoh's code runs."""
+    opening = threading.Thread(target=time.sleep, args=(0.2,), daemon=True)
+
+    def fail(*_: object) -> None:
+        raise failure
+
+    def create(*_: object) -> SimpleNamespace:
+        opening.start()
+        return SimpleNamespace(opening=opening, wait=fail if where == "wait" else lambda: None)
+
+    monkeypatch.setattr(new_stop, "NewStop", create)
+    monkeypatch.setattr(stop_commands, "confirmed", fail)
+    with pytest.raises(type(failure)):
+        stop_commands.stopping(Command.STOP)()
+    assert not opening.is_alive()
 
 
 def test_what_a_command_opens_never_has_the_number_of_a_closed_standard_stream() -> None:

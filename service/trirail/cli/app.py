@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 import warnings
-from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal
@@ -47,6 +46,7 @@ app = App(
     name="trirail",
     help="Drives a 3-PRP planar robot, or a UVW, XXY or 3-PPR stage, in real time: goals by Zenoh, setpoints by CAN.",
     version=f"trirail {__version__}",
+    console=terminal.out,
 )
 
 
@@ -311,8 +311,8 @@ def main() -> None:
         code = 130
     except terminal.Terminated as terminated:
         code = 128 + terminated.number
-    except BrokenPipeError:  # the reader, such as head, has closed the pipe
-        sys.stderr.close()
+    except BrokenPipeError:  # the reader, such as head, has closed the pipe of an endless output
+        terminal.discard(sys.stdout)
         code = 0
     except OSError as error:
         _print_system_error(error, words)
@@ -326,7 +326,7 @@ def _print_failure(error: TrirailError, words: list[str]) -> None:
         try:
             terminal.print_error_json(error)
         except OSError:
-            _discard_output()
+            terminal.discard(sys.stdout)
         else:
             return
     terminal.print_error(str(error))
@@ -338,17 +338,11 @@ def _print_system_error(error: OSError, words: list[str]) -> None:
     try:
         sys.stdout.flush()
     except OSError:
-        _discard_output()
+        terminal.discard(sys.stdout)
         terminal.print_error(f"standard output: {reason}")
         return
     is_named = isinstance(error.filename, str | bytes) and error.filename
     _print_failure(TrirailError(f"{os.fsdecode(error.filename)}: {reason}" if is_named else reason), words)
-
-
-def _discard_output() -> None:
-    """Discard the output that cannot be written. Python would try again at its end, and exit with 120."""
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _wrong_usage(error: CycloptsError, words: list[str]) -> str:

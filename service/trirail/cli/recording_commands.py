@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -181,7 +180,7 @@ def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json =
     elif out is not None:
         terminal.print_line(f"URDF written to {out}")
     else:
-        sys.stdout.write(text)
+        terminal.write(text)
     return 0
 
 

@@ -411,14 +411,15 @@ def events(
             until_now = itertools.takewhile(
                 lambda event: event.t <= now, robot.events(history=True, timeout=HISTORY_TIMEOUT_S)
             )
-            for event in deque(until_now, maxlen=last or None):
+            for event in terminal.until_reader_leaves(deque(until_now, maxlen=last or None)):
                 _show_event(service, event)
                 seen = event.run, event.seq
             if not follow:
                 return 0
-        for event in itertools.dropwhile(
+        later = itertools.dropwhile(
             lambda event: event.run == seen[0] and event.seq <= seen[1], robot.events(history=True)
-        ):
+        )
+        for event in terminal.until_reader_leaves(later):
             _show_event(service, event)
     return 0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Literal
 
 from trirail.cli import terminal
@@ -22,7 +21,7 @@ def script(app: App, shell: Shell | None, *, install: bool) -> int:
         if install:
             terminal.print_line(f"installed: {app.install_completion(shell=shell)}; new shells complete trirail")
         else:
-            sys.stdout.write(app.generate_completion(shell=shell))
+            terminal.write(app.generate_completion(shell=shell))
     except ShellDetectionError as error:
         raise TrirailError("shell not recognised: use bash, zsh or fish") from error
     except OSError as error:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 from rich.console import Console
@@ -31,9 +32,39 @@ if TYPE_CHECKING:
     from trirail.config import Config
     from trirail.diagnosis import Check
 
-out = Console(highlight=False, emoji=False)
-err = Console(stderr=True, highlight=False, emoji=False)
+_reader_left = threading.Event()
+"""Set when a line was written to a pipe whose reader had closed it."""
 
+
+def discard(stream: IO[str]) -> None:
+    """Discard what is written to a stream from now on. Python would try again at its end, and exit with 120."""
+    with contextlib.suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
+
+
+class _CommandConsole(Console):
+    """Console of a command, which continues to its own exit code if the reader of its output, such as head, leaves."""
+
+    def on_broken_pipe(self) -> None:
+        """Discard the output, whereas Rich would exit with code 1."""
+        _reader_left.set()
+        discard(self.file)
+
+
+def until_reader_leaves(items: Iterable[T]) -> Iterator[T]:
+    """Yield items to print. Raises BrokenPipeError when the reader of the output has closed its pipe."""
+    for item in items:
+        yield item
+        if _reader_left.is_set():
+            raise BrokenPipeError
+
+
+out = _CommandConsole(highlight=False, emoji=False)
+err = _CommandConsole(stderr=True, highlight=False, emoji=False)
+
+T = TypeVar("T")
 COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.items()}
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
 VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
@@ -80,14 +111,22 @@ def print_error(words: str) -> None:
     err.print(f"trirail: {plain(shortened(' '.join(words.split())))}", soft_wrap=True)
 
 
+def write(text: str) -> None:
+    """Write text to standard output as it is, and flush the output."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        out.on_broken_pipe()
+
+
 def json(content: object) -> None:
     """Print one JSON object on its own line, and flush the output."""
     try:
         line = msgspec.json.encode(content).decode()
     except UnicodeEncodeError:  # the name of a file need not be UTF-8
         line = dumps(msgspec.to_builtins(content))
-    sys.stdout.write(json_printable(line, sys.stdout.encoding) + "\n")
-    sys.stdout.flush()
+    write(json_printable(line, sys.stdout.encoding) + "\n")
 
 
 def print_error_json(error: TrirailError) -> None:
