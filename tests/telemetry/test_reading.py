@@ -210,7 +210,8 @@ def file_left_open(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
-    text, empty, cut = (tmp_path / name for name in ("text.rrd", "empty.rrd", "cut.rrd"))
+    text, empty, cut, header = (tmp_path / f"{name}.rrd" for name in ("text", "empty", "cut", "header"))
+    header.write_bytes(b"RRF2\0\x20\0\0\1\0\0")
     text.write_text("t,x,y\n")
     empty.write_bytes(b"")
     written(tmp_path / "whole.rrd", made.records(0.1))
@@ -221,10 +222,25 @@ def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
         text: "not a recording: an RRD file begins with RRF2",
         empty: "not a recording: an RRD file begins with RRF2",
         cut: "contains no",
+        header: "cut off in its header",
     }.items():
         with pytest.raises(ServiceError, match=f"^{re.escape(str(path))}: {why}") as raised:
             read(path)
         assert "\n" not in str(raised.value)
+
+
+@given(st.integers(0, 40), st.binary(max_size=12), st.integers(0, 40))
+def test_an_error_names_the_file_and_not_a_copy(file_left_open: bytes, cut: int, other: bytes, at: int) -> None:
+    """Of a file that was cut off, Rerun reads a copy."""
+    content = bytearray(file_left_open[:cut])
+    content[at : at + len(other)] = other
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.rrd")
+        path.write_bytes(content)
+        with pytest.raises(ServiceError) as raised:
+            read(path)
+        assert str(raised.value).startswith(str(path))
+        assert set(re.findall(r"\S*a\.rrd", str(raised.value))) == {str(path)}
 
 
 def test_a_file_that_the_operating_system_refuses_is_refused_with_its_path(

@@ -147,7 +147,7 @@ def read_session(paths: Sequence[str | os.PathLike[str]]) -> Recording:
 
 
 def join(parts: Sequence[Recording]) -> Recording:
-    """Join the recordings of a session's files, given in any order.
+    """Join the recordings of a session's files, given in any order. What several files contain is read once.
 
     Raises ServiceError if the recordings belong to different sessions.
     """
@@ -164,10 +164,19 @@ def join(parts: Sequence[Recording]) -> Recording:
         records=np.concatenate([part.records for part in parts])[rows],
         t=np.concatenate([part.t for part in parts])[rows],
         wall=np.concatenate([part.wall for part in parts])[rows],
-        events=sorted((line for part in parts for line in part.events), key=lambda line: line.t),
+        events=sorted(
+            {_identity(line): line for part in parts for line in part.events}.values(), key=lambda line: line.t
+        ),
         texts=first.texts,
-        requests=tuple(sorted((item for part in parts for item in part.requests), key=lambda item: item.seq)),
+        requests=tuple(
+            sorted({item.seq: item for part in parts for item in part.requests}.values(), key=lambda item: item.seq)
+        ),
     )
+
+
+def _identity(line: Line) -> tuple[object, ...]:
+    """Return a key that only the copies of a line in several files share."""
+    return (line.t, line.text) if line.event is None else (line.event.run, line.event.seq)
 
 
 def _size(path: Path) -> int | None:
@@ -213,6 +222,8 @@ def _complete_length(path: Path) -> int:
     with files.open_regular(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
+        if os.fstat(file.fileno()).st_size < _FILE_HEADER:
+            raise ServiceError(f"{path}: cut off in its header: the recording is empty")
         size, end = os.fstat(file.fileno()).st_size, _FILE_HEADER
         filled = min(size, _filled_length(file, size) + _LAST_NULS)
         while end + _MESSAGE_HEADER.size <= size:
@@ -249,7 +260,8 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
             raise ServiceError(f"{path}: contains no recording")
         return [chunk for chunk in reader.stream() if chunk.is_static or chunk.entity_path in _READ_ENTITIES]
     except (RuntimeError, ValueError) as error:
-        raise ServiceError(f"{path}: cannot be read as a recording: {error}") from error
+        reason = str(error).replace(str(whole), str(path))  # Rerun names the file, which can be a copy
+        raise ServiceError(f"{path}: cannot be read as a recording: {reason}") from error
 
 
 def _cycles(
