@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import shutil
 import tempfile
 from collections import Counter, namedtuple
 from collections.abc import Callable
@@ -22,6 +25,8 @@ from trirail.telemetry import contents, retention
 from trirail.telemetry import sessions as found_sessions
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.contents import Contents, FaultEntry, read_contents
+from trirail.telemetry.journal import Line
+from trirail.telemetry.reading import join, read
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.retention import sidecar
 from trirail.telemetry.rotation import claim
@@ -277,6 +282,95 @@ def test_a_recording_with_nothing_usable_beside_it_is_read(shelf: Path, damage: 
     assert sessions(shelf, "--rebuild") == before
 
 
+def test_a_reason_that_passes_is_not_kept(shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = min(shelf.glob("*.rrd"))
+    cut = tmp_path / whole.name
+    cut.write_bytes(whole.read_bytes()[:-100])
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr("shutil.copyfile", refuse)
+        (told,) = sessions(tmp_path)
+        assert "No space left" in str(told.trouble)
+        contents.save(cut, Contents(cut.name, "", trouble=told.trouble))  # as earlier versions did
+    (told,) = sessions(tmp_path)
+    assert (told.trouble, told.robot) == (None, "one")
+    assert contents.load(cut) is not None
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "nothing": lambda path: path.write_bytes(b""),
+    "header": lambda path: path.write_bytes(path.read_bytes()[:9]),
+    "text": lambda path: path.write_text("t,x,y\n"),
+    "middle": lambda path: path.write_bytes(path.read_bytes().replace(b"trirail", b"\0" * 7)),
+}
+FILTERS = ["--robot=one", "--since=2026-01-01", "--until=2027-01-01", "--user=eva", "--fault=emcy", "--outcome=done"]
+
+
+@pytest.mark.parametrize("option", FILTERS)
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_a_file_that_cannot_be_read_is_listed_or_named(
+    shelf: Path, tmp_path: Path, damage: Callable[[Path], object], option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def printed(*words: str) -> str:
+        assert app(["sessions", str(tmp_path), *words], exit_on_error=False, result_action="return_value") == 0
+        return capsys.readouterr().out
+
+    for path in shelf.glob("one-*.rrd"):
+        damage(Path(shutil.copy(path, tmp_path)))
+    (name,) = (path.name for path in tmp_path.iterdir())
+    answer = json.loads(printed(option, "--json"))
+    assert [*answer["unreadable"], *(file for each in answer["sessions"] for file in each["files"])] == [name]
+    assert bool(answer["sessions"]) is (option == "--robot=one")
+    assert name in printed(option)
+    assert not sidecar(tmp_path / name).exists()
+    assert json.loads(printed("--robot=two", "--json"))["unreadable"] == [name]
+    assert not sessions(tmp_path, "--robot=two")
+
+
+@settings(max_examples=5)
+@given(st.sampled_from([os.mkfifo, os.mkdir, lambda path: os.symlink("/dev/zero", path)]))
+def test_what_is_not_a_regular_file_is_no_recording(make: Callable[[Path], None]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "demo-20260131-120000.rrd")
+        make(path)
+        assert recorded(Path(folder)) == []
+        assert [*Path(folder).iterdir()] == [path]
+        retention.tidy(Path(folder), -1.0)  # does not wait for a writer
+
+
+@settings(max_examples=30)
+@given(st.data())
+def test_what_several_files_of_a_session_contain_is_read_once(shelf: Path, data: st.DataObject) -> None:
+    whole = read(min(shelf.glob("*.rrd")))
+    lines = [Line(t, np.datetime64("2026-01-31"), "INFO", text) for t, text in ((0.1, "a"), (0.1, "b"), (0.2, "a"))]
+    whole = whole._replace(events=sorted([*whole.events, *lines], key=lambda line: line.t))
+    holders = st.sets(st.sampled_from(range(3)), min_size=1)
+    of_events, of_requests, of_records = (
+        data.draw(st.lists(holders, min_size=len(items), max_size=len(items)))
+        for items in (whole.events, whole.requests, range(10))
+    )
+    blocks = np.array_split(np.arange(len(whole.records)), 10)
+    parts = []
+    for number in range(3):
+        rows = np.concatenate([blocks[0], *(blocks[k] for k in range(1, 10) if number in of_records[k])])
+        parts.append(
+            whole._replace(
+                records=whole.records[rows],
+                t=whole.t[rows],
+                wall=whole.wall[rows],
+                events=[line for line, held in zip(whole.events, of_events, strict=True) if number in held],
+                requests=tuple(item for item, held in zip(whole.requests, of_requests, strict=True) if number in held),
+            )
+        )
+    joined = join(parts)
+    assert made.bits(joined.records) == made.bits(whole.records)
+    assert joined.requests == whole.requests
+    assert sorted(map(repr, joined.events)) == sorted(map(repr, whole.events))
+
+
 def test_rebuild_reads_what_seems_usable(shelf: Path) -> None:
     before = sessions(shelf)
     beside = sidecar(min(shelf.glob("*.rrd")))
@@ -359,9 +453,9 @@ def read_in(folder: Path) -> list[Path]:
     return found
 
 
-def test_what_is_being_written_is_left_alone(tmp_path: Path) -> None:
+def test_what_is_being_written_is_left_alone(shelf: Path, tmp_path: Path) -> None:
     written = tmp_path / "demo-20260301-120000.rrd"
-    written.write_bytes(b"RRF2")
+    shutil.copy(min(shelf.glob("*.rrd")), written)
     lock = retention.lock(written)
     assert sessions(tmp_path) == []
     assert read_in(tmp_path) == []

@@ -84,7 +84,7 @@ def sessions(
     rebuild
         Read every recording, and write the .json file beside it again.
     """
-    from trirail.telemetry.sessions import SessionFilter, fault_codes, find, recorded
+    from trirail.telemetry.sessions import SessionFilter, fault_codes, find, recorded, unreadable
 
     if not folder.is_dir():
         raise ServiceError(f"{folder}: no such folder: use the folder of [telemetry] directory")
@@ -95,10 +95,14 @@ def sessions(
     matches = find(files, wanted)
     known = fault_codes(files) if fault is not None and not find(files, SessionFilter(fault=fault)) else []
     shown = matches[-last:] if last else matches
+    unknown = unreadable(files, matches)
     if json:
-        terminal.json({"folder": str(folder), "found": len(matches), "sessions": msgspec.to_builtins(shown)})
+        content = {"folder": str(folder), "found": len(matches), "sessions": msgspec.to_builtins(shown)}
+        terminal.json(content | {"unreadable": unknown})
         return 0
     _print(shown, len(matches))
+    if unknown:
+        terminal.print_line(f"not listed, because they cannot be read: {', '.join(unknown)}")
     if known:
         terminal.print_line(f"no recorded fault contains {quoted(fault or '')}; known faults: {', '.join(known)}")
     return 0

@@ -16,7 +16,7 @@ import msgspec
 from trirail_drivers import files
 
 from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
-from trirail.telemetry.retention import BLACK_BOX, sidecar
+from trirail.telemetry.retention import BLACK_BOX, robot_in, sidecar
 from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.messages import Event, FaultDetail, Notice
 from trirail.wire.packets import Announcement, CheckRequest, CommandRequest, ControlInput, GoalRequest
@@ -116,11 +116,14 @@ def load(recording: Path) -> Contents | None:
 
 
 def read_contents(path: Path) -> Contents:
-    """Read the contents of a recording. If the recording cannot be read, `trouble` contains the reason."""
+    """Read the contents of a recording.
+
+    If the recording cannot be read, `trouble` contains the reason. The robot is then that in the name of the file.
+    """
     from trirail.telemetry import provenance  # imported late, because importing Rerun takes most of the start-up time
     from trirail.telemetry.reading import read
 
-    contents = Contents(path.name, "")
+    contents = Contents(path.name, robot_in(path.name))
     try:
         recording = read(path)
         config = provenance.configuration(recording.texts)
@@ -129,7 +132,8 @@ def read_contents(path: Path) -> Contents:
     except (ServiceError, ConfigError, OSError) as error:
         contents.trouble = str(error)
         return contents
-    contents.robot = config.robot.name if config is not None else ""
+    if config is not None:
+        contents.robot = config.robot.name
     began, ended = (float(wall.astype("datetime64[ns]").astype(int)) * 1e-9 for wall in recording.wall[[0, -1]])
     contents.add_cycles(began, ended, len(recording.records))
     for line in recording.events:

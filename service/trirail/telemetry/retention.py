@@ -27,6 +27,12 @@ The session and each part have a number if their name without it was in use.
 """
 
 
+def robot_in(name: str) -> str:
+    """Return the robot in a file name that the recorder chose; "" for a black box and for other names."""
+    match = _NAME.fullmatch(name)
+    return match["name"] if match is not None and not name.startswith(BLACK_BOX) else ""
+
+
 def sidecar(recording: Path) -> Path:
     """Return the path of a recording's sidecar, which contains a summary, such as demo-20260131-120000.rrd.json."""
     return recording.with_name(f"{recording.name}.json")
@@ -55,7 +61,7 @@ def lock(path: Path) -> int:
     Return a file descriptor, which must be passed to `unlock` later, or -1 if the file cannot be opened.
     """
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except OSError:
         return -1
     with contextlib.suppress(OSError):  # a network file system may not support locks
@@ -72,7 +78,7 @@ def unlock(descriptor: int) -> None:
 def is_being_written(path: Path) -> bool:
     """Return True if a recorder in this or another process has locked the file. Raises FileNotFoundError."""
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a FIFO would wait for a writer
     except PermissionError:
         return False
     try:

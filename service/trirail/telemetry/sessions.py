@@ -58,7 +58,9 @@ class RecordedSession(Struct):
 def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], None] | None = None) -> list[Contents]:
     """Return the contents of each recording in a folder, sorted by the name of the recording.
 
-    A recording that is still being written is omitted until the recorder has written a sidecar for it.
+    A recording that is still being written is omitted until the recorder has written a sidecar for it. If a recording
+    cannot be read, no sidecar is written, because the reason can lie outside the file: no space for a copy of it, no
+    permission, or an older version of the software.
 
     Parameters
     ----------
@@ -66,7 +68,7 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
         Folder of the recordings.
     reread
         True to read all recordings again and to rewrite their sidecars; False to read only recordings without a usable
-        sidecar.
+        sidecar. A sidecar with `trouble`, from an earlier version, is not usable.
     on_read
         Function called with each recording before it is read.
 
@@ -76,10 +78,11 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
         The folder cannot be listed.
     """
     listed = []
-    recordings = [path for path in folder.iterdir() if path.suffix == ".rrd"]  # glob hides that a folder is unreadable
+    # glob hides that a folder is unreadable
+    recordings = [path for path in folder.iterdir() if path.suffix == ".rrd" and path.is_file()]
     for path in sorted(recordings, key=lambda path: path.name):
         known = contents.load(path)
-        if known is None or known.running or reread:
+        if known is None or known.running or known.trouble is not None or reread:
             try:
                 being_written = is_being_written(path)
             except FileNotFoundError:
@@ -88,8 +91,9 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
                 if on_read is not None:
                     on_read(path)
                 known = contents.read_contents(path)
-                with contextlib.suppress(OSError):  # the folder belongs to another user: read the file again next time
-                    contents.save(path, known)
+                if known.trouble is None:
+                    with contextlib.suppress(OSError):  # the folder belongs to another user: read it again next time
+                        contents.save(path, known)
         if known is not None:
             listed.append(known)
     return listed
@@ -102,6 +106,12 @@ def find(files: Iterable[Contents], wanted: SessionFilter = SessionFilter()) -> 
         parts_of.setdefault(file.session, []).append(file)
     sessions = [_joined(parts) for parts in parts_of.values() if _is_wanted(parts, wanted)]
     return sorted(sessions, key=lambda session: session.began or 0.0)
+
+
+def unreadable(files: Iterable[Contents], matches: Iterable[RecordedSession]) -> list[str]:
+    """Return the names of the files that cannot be read and of whose sessions it is thus unknown if they match."""
+    listed = {name for session in matches for name in session.files}
+    return [file.name for file in files if file.trouble is not None and file.name not in listed]
 
 
 def fault_codes(files: Iterable[Contents]) -> list[str]:
