@@ -24,7 +24,7 @@ import msgspec
 import pytest
 from cyclopts import App
 from generated import thinned
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from trirail import __main__
 from trirail.cli import app, help_pages, live, notation, recording_commands, stop_commands, terminal, view
@@ -32,6 +32,7 @@ from trirail.client import client, connection, new_stop
 from trirail.client.goal import Result
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.telemetry import contents
 from trirail.wire.goal_kind import GoalKind, field_description
 from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.messages import GoalReply
@@ -622,6 +623,36 @@ def test_watch_into_a_pipe_is_a_line_a_second(monkeypatch: pytest.MonkeyPatch) -
         live.watch(Moving(1.0), json_lines=False)  # type: ignore[arg-type]
     assert [line.split("   ")[0] for line in said] == [f"{t} s  moving  x 10.000 mm" for t in ("0.00", "1.00", "2.00")]
     assert said[0].endswith("goal g-1 40%  a")
+
+
+@given(line=st.sampled_from(["ik 0 0 0", "workspace", "sessions {}"]), columns=st.integers(10, 200))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_listing_in_a_pipe_is_neither_wrapped_nor_cut(
+    line: str, columns: int, named_session: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = line.format(named_session).split()
+    with monkeypatch.context() as wide:
+        wide.setenv("COLUMNS", "1000")
+        code, expected, _ = run(*words)
+    with monkeypatch.context() as narrow:
+        narrow.setenv("COLUMNS", str(columns))
+        assert run(*words)[:2] == (code, expected)
+    assert code == 0
+    assert all(len(line) == len(line.rstrip()) for line in expected.splitlines())
+
+
+@pytest.fixture(scope="module")
+def named_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the sidecar of a session whose line is long."""
+    folder = tmp_path_factory.mktemp("listed")
+    name = f"{'robot' * 10}-20260131-120000.rrd"
+    (folder / name).touch()
+    outcomes = {"done": 1000, "faulted": 10, "preempted": 100, "stopped": 200}
+    users = {f"operator-{number}" for number in range(9)}
+    contents.save(
+        folder / name, contents.Contents(name, "robot" * 10, 1e9, 1e9 + 5e3, 9, users, {"operator-1": outcomes})
+    )
+    return folder
 
 
 PRINTS: dict[str, Callable[[], object]] = {

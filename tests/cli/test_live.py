@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 from trirail.cli import live, pendant, terminal
@@ -202,3 +202,17 @@ def test_a_pose_is_shown_only_if_all_sliders_are_homed(homed: tuple[bool, bool, 
     assert near_names >= {f"slider {name}" for name, known in zip(NAMES, homed, strict=True) if known}
     assert near_names <= {"x", "y", "φ"} | {f"slider {n}" for n, known in zip(NAMES, homed, strict=True) if known}
     assert ("x" in near_names) is all(homed)
+
+
+@given(columns=st.integers(10, 200), faults=st.lists(st.text("ab ", min_size=1, max_size=200), max_size=2))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_state_in_a_pipe_is_neither_wrapped_nor_cut(
+    columns: int, faults: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown = []
+    for width in (columns, 1000):
+        with monkeypatch.context() as terminal_of_width:
+            terminal_of_width.setenv("COLUMNS", str(width))
+            live.show(a_state(faults=tuple(faults)), info(load(SIM)))
+            shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1]

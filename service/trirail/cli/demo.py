@@ -12,7 +12,7 @@ from typing import NamedTuple
 from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
 from trirail.cli.config_commands import shipped_file
-from trirail.cli.terminal import out, percentiles, plain
+from trirail.cli.terminal import out, percentiles, plain, print_line
 from trirail.client import own_service
 from trirail.client.client import Result, Robot
 from trirail.config import Config, load
@@ -84,7 +84,8 @@ def run(name: str = "sim", *, stay: bool, record: Path | None) -> int:
     recording = record or Path(config.telemetry.directory) / f"demo-{stamp}.rrd"
     locator = config.zenoh.listen[0]
     out.print(
-        f"[bold]trirail demo[/]: starting the service on {file.name}, simulated drives at {config.loop.rate_hz} Hz"
+        f"[bold]trirail demo[/]: starting the service on {file.name}, simulated drives at {config.loop.rate_hz} Hz",
+        soft_wrap=True,
     )
     with contextlib.ExitStack() as stack:
         with out.status("starting the service") as status:
@@ -138,7 +139,8 @@ def _tour(robot: Robot, stages: Sequence[DemoMove]) -> Iterator[_Row]:
             colour = "green" if result.outcome == "done" else "red"
             progress.console.print(
                 f"  [{colour}]{result.outcome:9}[/] {stage.name:28} {seconds:5.2f} s"
-                + ("" if result.outcome == "done" else f"  {plain(result.message)}")
+                + ("" if result.outcome == "done" else f"  {plain(result.message)}"),
+                soft_wrap=True,
             )
             yield _Row(stage, result, seconds)
 
@@ -161,7 +163,7 @@ def _report(rows: list[_Row], state: State, recording: Path) -> None:
 
 def _stay() -> None:
     out.print()
-    out.print("The service stays up, enabled. In another terminal: trirail goto 0.03 0.02 0.2 --wait")
+    print_line("The service stays up, enabled. In another terminal: trirail goto 0.03 0.02 0.2 --wait")
     out.print("Live view: trirail view, or in the browser: trirail view --web")
     out.print("Ctrl-C ends it.")
     with Signals() as ends:

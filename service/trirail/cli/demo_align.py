@@ -95,7 +95,7 @@ def run(file: Path, recording: Path, parts: int = PART_COUNT, seed: int = 0) -> 
     config = load(file)
     recording.parent.mkdir(parents=True, exist_ok=True)
     pictures = recording.with_name(f"{recording.stem}-pictures.rrd")
-    out.print(f"[bold]trirail demo align[/]: starting the service on {plain(file.name)}")
+    out.print(f"[bold]trirail demo align[/]: starting the service on {plain(file.name)}", soft_wrap=True)
     built = built_otherwise(corrected_geometry(config), np.random.default_rng(seed), BUILT_OFF, BUILT_TURNED)
     stage, results = StageAsBuilt(built, (PLAY, PLAY, PLAY)), []
     with own_service.service(file, recording), rr.RecordingStream("trirail_align") as stream:
@@ -152,7 +152,7 @@ def _parts(robot: Robot, cameras: DrawnCameras, stream: rr.RecordingStream, part
             stream.set_time("time", duration=each.time)
             stream.log("residual/worst_um", rr.Scalars(1e6 * each.worst))
             stream.log("residual/turn_urad", rr.Scalars(1e6 * each.turn))
-        out.print(f"  [{'green' if result.reached else 'red'}]{line}[/]")
+        out.print(f"  [{'green' if result.reached else 'red'}]{line}[/]", soft_wrap=True)
         results.append(result)
     return results
 

@@ -326,7 +326,7 @@ def _print_differences(one: str, other: str, rows: Iterable[tuple[ParameterDiffe
     for each, why in rows:
         values = (_value(each.one), _value(each.other))
         table.add_row(_named(each.key), *map(terminal.plain, (each.name, *values, why)))
-    terminal.out.print(table)
+    terminal.print_table(table)
 
 
 def _as_json(each: ParameterDifference) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -52,12 +52,16 @@ def fleet(*, service: Service = HERE) -> int:
 def _print_changes(seen: Fleet, never: threading.Event) -> None:
     """Print a line for each robot, and print the line again whenever it changes."""
     printed: dict[str, str] = {}
+    for member in terminal.until_reader_leaves(_members(seen, never)):
+        line = _line(member, time.monotonic())
+        if printed.get(member.robot) != line:
+            printed[member.robot] = line
+            terminal.print_line(f"{wall_clock(time.time())}  {line}")
+
+
+def _members(seen: Fleet, never: threading.Event) -> Iterator[Member]:
     while not never.wait(REFRESH_S):
-        for member in seen.members():
-            line = _line(member, time.monotonic())
-            if printed.get(member.robot) != line:
-                printed[member.robot] = line
-                terminal.print_line(f"{wall_clock(time.time())}  {line}")
+        yield from seen.members()
 
 
 def _line(member: Member, now: float) -> str:

@@ -181,7 +181,7 @@ def show(*, folder: AuthorityFolder = HERE, json: Json = False) -> int:
         table.add_row(terminal.plain(each.name), "robot" if each.serves else "user", left[1], left[0], trouble)
     for name in gone:
         table.add_row(name, "revoked")
-    terminal.out.print(table)
+    terminal.print_table(table)
     return 0
 
 

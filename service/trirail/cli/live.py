@@ -26,6 +26,7 @@ from trirail.cli.terminal import (
     percentiles,
     plain,
     print_line,
+    print_table,
     until_reader_leaves,
 )
 from trirail.errors import ServiceError, TrirailError
@@ -49,7 +50,10 @@ def show(state: State, info: Info) -> None:
     grid = table(state, info.robot, info.labels, limits_of(info))
     if info.correction is not None:
         grid.add_row("corrected", plain(notation.correction(info.correction, info.labels)))
-    out.print(grid)
+    if out.is_terminal:
+        out.print(grid)  # long values continue in their own column
+    else:
+        print_table(grid)
     _missing(info.missing_protections, info.labels)
 
 

@@ -162,7 +162,7 @@ def _print_joints(robot: Geometry, solved: dict[str, list[float]], sensitivities
     columns = sensitivities.T * [[1.0], [1.0], [1e3 * math.radians(1.0)]]
     for axis, unit, values in zip("xyφ", ("mm/mm", "mm/mm", "mm/°"), columns.tolist(), strict=True):
         table.add_row(f"slider per {axis}", *(notation.number(value, 3) for value in values), unit)
-    terminal.out.print(table)
+    terminal.print_table(table)
 
 
 def workspace(
@@ -265,7 +265,7 @@ def _print_extents(service: Extent, reach: Extent, at_zero: tuple[float, float])
     table.add_row("greatest area", *(notation.number(each.best_area * CM2, 3) for each in both), "cm²")
     table.add_row("  at φ =", *(notation.number(math.degrees(each.best_phi), 2) for each in both), "°")
     table.add_row("volume", *(notation.number(each.volume * CM2, 3) for each in both), "cm² rad")
-    terminal.out.print(table)
+    terminal.print_table(table)
 
 
 def _print_slices(slices: list[tuple[float, float, float]]) -> None:
@@ -274,7 +274,7 @@ def _print_slices(slices: list[tuple[float, float, float]]) -> None:
         table.add_row(
             notation.number(math.degrees(angle), 2), *(notation.number(each * CM2, 3) for each in (inside, whole))
         )
-    terminal.out.print(table)
+    terminal.print_table(table)
 
 
 def _range(ends: tuple[float, float], scale: float) -> str:

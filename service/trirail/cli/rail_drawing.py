@@ -43,4 +43,4 @@ def show(stops: Stops) -> None:
     table.add_row("quick stop", f"{stops.quick_way * 1e3:.3g}", f"{stops.quick_time:.3g}")
     if stops.left is not None:
         table.add_row("rail left beyond the travel", f"{stops.left * 1e3:.3g}", "")
-    terminal.out.print(table)
+    terminal.print_table(table)

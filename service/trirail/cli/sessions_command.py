@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 from cyclopts import Parameter, Token, validators
-from rich.padding import Padding
 
 from trirail.cli import terminal
 from trirail.cli.options import Flag, Json
@@ -145,9 +144,9 @@ def _print(listed: list[RecordedSession], of: int) -> None:
             ),
             terminal.plain(", ".join(session.users)),
         )
-        terminal.out.print("  ".join(filter(None, head)))
+        terminal.out.print("  ".join(filter(None, head)), soft_wrap=True)
         for line in filter(None, (*map(terminal.plain, session.files), _faults(session), _lost(session))):
-            terminal.out.print(Padding(line, (0, 0, 0, 4)))
+            terminal.out.print(f"    {line}", soft_wrap=True)
     sessions = terminal.counted(of, "session")
     terminal.print_line(f"{len(listed)} of {sessions}" if len(listed) < of else sessions)
 

@@ -15,7 +15,9 @@ import msgspec
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 from trirail_drivers.bus import load
 from trirail_drivers.errors import shortened
 
@@ -72,6 +74,10 @@ SERVICE_TIMEOUT_S = 3.0
 """Time without an answer after which the service counts as gone [s]."""
 
 
+TABLE_WIDTH = 10_000
+"""Maximum width of a table [characters]."""
+
+
 class Terminated(BaseException):
     """Signal that asks this process to end. As after Ctrl-C, the command stops its goal and releases its lease."""
 
@@ -93,6 +99,15 @@ def counted(number: int, what: str) -> str:
 def print_line(words: str) -> None:
     """Print a line."""
     out.print(plain(words), soft_wrap=True)
+
+
+def print_table(rows: Table) -> None:
+    """Print a table in its whole width, which neither a narrow terminal nor a pipe reduces."""
+    whole = out.render(rows, out.options.update(max_width=TABLE_WIDTH))
+    for segments in Segment.split_lines(whole):
+        line = Text.assemble(*((text, style or "") for text, style, _ in segments))
+        line.rstrip()
+        out.print(line, soft_wrap=True)
 
 
 @contextlib.contextmanager
@@ -144,14 +159,14 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
     from trirail.diagnosis.drive_checks import plan_traffic, usage_of
 
     loop, recorder = ready["loop"], ready["recorder"]
-    out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz")
+    out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz", soft_wrap=True)
     out.print(f"    goals      {plain(', '.join(config.zenoh.listen))}", soft_wrap=True)
     if recorder["live"]:
         out.print(f"    live view  trirail view  ({recorder['live']})", soft_wrap=True)
     out.print(f"    recording  {plain(recorder['recording'])}", soft_wrap=True)
     if url := metrics_url(config):
         out.print(f"    metrics    {plain(url)}", soft_wrap=True)
-    out.print(f"    bus load   {usage_of(config, loop['bus_load'])}")
+    out.print(f"    bus load   {usage_of(config, loop['bus_load'])}", soft_wrap=True)
     out.print(f"    next       {plain(' '.join(['trirail enable', *_reach(config)]))}", soft_wrap=True)
     if omission := plan_traffic(config).omission:
         out.print(f"    [yellow]warning[/] {omission}", soft_wrap=True)
