@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from trirail.cli import live, pendant, terminal
 from trirail.client import picture
-from trirail.client.client import Robot
+from trirail.client.client import Jog, Robot
 from trirail.config import SIM, load
 from trirail.processes.publications import info
 from trirail.wire.state import (
@@ -216,3 +216,14 @@ def test_a_state_in_a_pipe_is_neither_wrapped_nor_cut(
             live.show(a_state(faults=tuple(faults)), info(load(SIM)))
             shown.append(capsys.readouterr().out)
     assert shown[0] == shown[1]
+
+
+@pytest.mark.parametrize("show", [True, False])
+def test_a_jog_that_prints_json_writes_no_terminal_codes(
+    show: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(live, "out", Console(force_terminal=True))
+    jog = SimpleNamespace(error=None, result="done")
+    robot = SimpleNamespace(name="demo", states=lambda _timeout: [a_state()])
+    live.show_jog(cast(Robot, robot), cast(Jog, jog), NAMES, show=show)
+    assert bool(capsys.readouterr().out) is show

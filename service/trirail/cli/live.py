@@ -105,10 +105,11 @@ def ending(jog: Jog, seconds: float | None) -> Iterator[None]:
 
 
 def show_jog(robot: Robot, jog: Jog, labels: Labels, *, show: bool = True) -> None:
-    """Show the pose during a jog until the jog ends."""
-    with Live(console=out, refresh_per_second=10, transient=True) as live:
+    """Show the pose during a jog until the jog ends; without `show`, only wait for the end."""
+    # Live writes the codes that hide the cursor even if it is never updated.
+    with Live(console=out, refresh_per_second=10, transient=True) if show else contextlib.nullcontext() as live:
         for state in robot.states(SERVICE_TIMEOUT_S):
-            if show:
+            if live is not None:
                 live.update(table(state, robot.name, labels))
             if jog.error is not None or jog.result is not None:
                 return
