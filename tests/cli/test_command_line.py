@@ -268,6 +268,11 @@ def test_output_to_a_full_disk_is_an_error_in_one_line(line: str, unbuffered: st
 def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code: int, said: str, run: Run) -> None:
     assert run(*line.split())[:2] == (code, "")
     assert said in run(*line.split())[2]
+    ended, out, err = run(*line.split(), "--json")
+    assert (ended, err) == (code, "")
+    answer = json.loads(out)
+    assert answer["ok"] is False
+    assert said.removeprefix("trirail: ") in answer["message"]
 
 
 @pytest.mark.parametrize("command", thinned(["stop", "status", "fleet", "view --web"], every=4))
@@ -695,7 +700,7 @@ def test_the_exit_code_is_that_of_the_command_whoever_closes_its_pipe(prints: li
 @pytest.mark.parametrize("name", ["line", "json"])
 def test_an_endless_output_ends_with_its_reader(name: str) -> None:
     def command() -> int:
-        for _ in terminal.until_reader_leaves(itertools.count()):
+        for _ in terminal.end_with_reader(itertools.count()):
             PRINTS[name]()
         return 1
 

@@ -29,7 +29,7 @@ COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
 UNNAMED = "stage"
 """Default name of a stage."""
-UNKNOWN = Pose(math.nan, math.nan, math.nan)
+NAN_POSE = Pose(math.nan, math.nan, math.nan)
 """Measured pose in a reading while a slider is not homed."""
 T = TypeVar("T", float, NDArray[np.float64])
 Keys = dict[str, DataKey]
@@ -147,7 +147,7 @@ class Stage(Monitored, AsyncReadable, HasHints):
 
     def readings(self, state: State) -> Readings:
         """Return all readings of a state."""
-        pose = state.measured_pose or UNKNOWN
+        pose = state.measured_pose or NAN_POSE
         values: dict[str, Any] = {
             **dict(zip((self.x.name, self.y.name, self.phi.name), pose, strict=True)),
             self.pose.name: np.array(pose),
@@ -232,7 +232,7 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         The setpoint is the target of the goal in progress; if there is no goal, it is the commanded value.
         """
         state = await (await self._stage.link()).robot.state()
-        return Location(setpoint=self._value(setpoint_of(state)), readback=self._value(state.measured_pose or UNKNOWN))
+        return Location(setpoint=self._value(setpoint_of(state)), readback=self._value(state.measured_pose or NAN_POSE))
 
     @WatchableAsyncStatus.wrap
     async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:

@@ -302,7 +302,7 @@ def main() -> None:
             result_action="return_value",
         )
     except CycloptsError as error:
-        terminal.print_error(_wrong_usage(error, words))
+        _print_failure(UsageError(_wrong_usage(error, words)), words)
         code = 2
     except TrirailError as error:
         _print_failure(error, words)
@@ -318,6 +318,10 @@ def main() -> None:
         _print_system_error(error, words)
         code = 1
     sys.exit(code if isinstance(code, int) else 0)
+
+
+class UsageError(TrirailError):
+    """The command line is wrong."""
 
 
 def _print_failure(error: TrirailError, words: list[str]) -> None:

@@ -29,7 +29,7 @@ def fleet(*, service: Service = HERE) -> int:
     """Show all robots at --connect, usually a router, until Ctrl-C; those that need attention are first.
 
     A robot is silent if its loop has sent nothing for 3 s. If the output is a file or pipe, the command prints a line
-    whenever a robot changes. With --json, it prints once after 2.5 s.
+    whenever a robot changes. With --json, it prints once after 2.5 s; `lateness` is in µs.
     """
     never = threading.Event()
     from trirail.client.fleet import Fleet
@@ -52,7 +52,7 @@ def fleet(*, service: Service = HERE) -> int:
 def _print_changes(seen: Fleet, never: threading.Event) -> None:
     """Print a line for each robot, and print the line again whenever it changes."""
     printed: dict[str, str] = {}
-    for member in terminal.until_reader_leaves(_members(seen, never)):
+    for member in terminal.end_with_reader(_members(seen, never)):
         line = _line(member, time.monotonic())
         if printed.get(member.robot) != line:
             printed[member.robot] = line

@@ -20,6 +20,7 @@ from trirail.cli.terminal import (
     COLOURS,
     SERVICE_TIMEOUT_S,
     budget_share,
+    end_with_reader,
     json,
     left,
     out,
@@ -27,7 +28,6 @@ from trirail.cli.terminal import (
     plain,
     print_line,
     print_table,
-    until_reader_leaves,
 )
 from trirail.errors import ServiceError, TrirailError
 from trirail.naming import Labels
@@ -63,7 +63,7 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
     limits = limits_of(info)
     with contextlib.suppress(KeyboardInterrupt):
         if json_lines:
-            for state in until_reader_leaves(robot.states(SERVICE_TIMEOUT_S)):
+            for state in end_with_reader(robot.states(SERVICE_TIMEOUT_S)):
                 json(msgspec.to_builtins(state))
         elif not out.is_terminal:
             _print_once_a_second(robot)
@@ -77,7 +77,7 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
 def _print_once_a_second(robot: Robot) -> None:
     """Print the state as a line once a second, for a file or pipe, where a table cannot be redrawn."""
     due = -math.inf
-    for state in until_reader_leaves(robot.states(SERVICE_TIMEOUT_S)):
+    for state in end_with_reader(robot.states(SERVICE_TIMEOUT_S)):
         if time.monotonic() >= due:
             due = time.monotonic() + 1.0
             goal = f"  goal {state.goal.id} {state.goal.progress:.0%}" if state.goal else ""

@@ -411,7 +411,7 @@ def events(
             until_now = itertools.takewhile(
                 lambda event: event.t <= now, robot.events(history=True, timeout=HISTORY_TIMEOUT_S)
             )
-            for event in terminal.until_reader_leaves(deque(until_now, maxlen=last or None)):
+            for event in terminal.end_with_reader(deque(until_now, maxlen=last or None)):
                 _show_event(service, event)
                 seen = event.run, event.seq
             if not follow:
@@ -419,7 +419,7 @@ def events(
         later = itertools.dropwhile(
             lambda event: event.run == seen[0] and event.seq <= seen[1], robot.events(history=True)
         )
-        for event in terminal.until_reader_leaves(later):
+        for event in terminal.end_with_reader(later):
             _show_event(service, event)
     return 0
 

@@ -55,7 +55,7 @@ class _CommandConsole(Console):
         discard(self.file)
 
 
-def until_reader_leaves(items: Iterable[T]) -> Iterator[T]:
+def end_with_reader(items: Iterable[T]) -> Iterator[T]:
     """Yield items to print. Raises BrokenPipeError when the reader of the output has closed its pipe."""
     for item in items:
         yield item
