@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from trirail.analysis.summary import summarise
 from trirail.cli import recording_commands
 from trirail.telemetry.recording import Recording
+from trirail.wire.packets import CommandRequest, ControlInput
 from trirail.wire.records import DTYPE
-from trirail.wire.vocabulary import MODES, Mode
+from trirail.wire.vocabulary import MODES, AcquireLease, Command, Mode
 
 PERIOD = 1e-3
 COUNT = 1e-7
@@ -73,3 +74,22 @@ def test_a_report_shows_the_time_without_records(capsys: pytest.CaptureFixture[s
     assert "not recorded" not in capsys.readouterr().out
     recording_commands._print_summary(summarise(recorded(np.delete(records, np.arange(150, 450)))))
     assert "not recorded 0.3 s" in " ".join(capsys.readouterr().out.split())
+
+
+LEASES = st.tuples(st.sampled_from(["ann", "ben"]), st.sampled_from(["l-1", "l-2", None]))
+
+
+@given(st.lists(LEASES | st.just("stop"), max_size=30))
+def test_a_lease_counts_once_however_often_it_is_renewed(given_commands: list[tuple[str, str | None] | str]) -> None:
+    requests = [
+        CommandRequest(seq, "ann", Command.STOP)
+        if isinstance(each, str)
+        else CommandRequest(seq, each[0], Command.ACQUIRE, AcquireLease(each[1]))
+        for seq, each in enumerate(given_commands)
+    ]
+    inputs = tuple(ControlInput(seq, 1, 1, request) for seq, request in enumerate(requests))
+    counted = summarise(recorded(session(1))._replace(requests=inputs)).commands
+    leases = [each for each in given_commands if each != "stop"]
+    expected = len({each for each in leases if each[1] is not None}) + sum(each[1] is None for each in leases)
+    assert counted.get("acquire", 0) == expected
+    assert counted.get("stop", 0) == given_commands.count("stop")

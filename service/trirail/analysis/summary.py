@@ -18,7 +18,7 @@ from trirail.wire.goals import kind_name
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.state import Percentiles
-from trirail.wire.vocabulary import MODES, Mode
+from trirail.wire.vocabulary import MODES, AcquireLease, Mode
 
 ENABLED_MODES = tuple(MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING))
 """Indices in MODES of the modes in which the drives follow the setpoints."""
@@ -119,7 +119,7 @@ class Summary(msgspec.Struct, frozen=True):
     lateness_us: Percentiles
     cycle_us: Percentiles
     commands: dict[str, int]
-    """Number of times that each command was given."""
+    """Number of times that each command was given; renewals of a lease are not counted."""
     goals: list[GoalSummary]
     alignments: list[AlignmentSummary]
     faults: list[Incident]
@@ -192,8 +192,18 @@ def _percentiles(nanoseconds: NDArray[np.int64]) -> Percentiles:
 
 
 def _commands(recording: Recording) -> dict[str, int]:
-    requests = (entry.given for entry in recording.requests)
-    return dict(Counter(str(each.name) for each in requests if isinstance(each, CommandRequest)))
+    """Count the commands. The renewals of a lease, which are requests with the same id, are not counted."""
+    counts, leases = Counter[str](), set[tuple[str, str]]()
+    for request in (entry.given for entry in recording.requests):
+        if not isinstance(request, CommandRequest):
+            continue
+        if isinstance(request.content, AcquireLease) and request.content.id is not None:
+            lease = request.user, request.content.id
+            if lease in leases:
+                continue
+            leases.add(lease)
+        counts[str(request.name)] += 1
+    return dict(counts)
 
 
 def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
