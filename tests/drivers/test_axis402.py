@@ -161,7 +161,7 @@ def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -
     assert not axis.pdo_silent
     axis.on_heartbeat(PRE_OPERATIONAL, T)
     assert axis.find_fault(T, WANTED) == ("B", "state", 0, "drive B: has left NMT operational and is pre-operational")
-    assert state_of(axis) is P.NOT_READY_TO_SWITCH_ON
+    assert state_of(axis) is P.SWITCHED_ON  # as far as is known, it still has power
     assert axis.pdo_silent
     assert axis.left_operational
     axis.on_heartbeat(OPERATIONAL, T)

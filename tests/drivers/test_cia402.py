@@ -459,6 +459,30 @@ class TestFaults:
         ready.drives.reset()
         assert ready.cycles(200).fault is None
 
+    @pytest.mark.parametrize("state", [Nmt.PRE_OPERATIONAL, Nmt.STOPPED])
+    def test_a_drive_that_left_operational_with_power_has_its_ramp_when_the_driver_closes(
+        self, enabled: Rig, state: Nmt
+    ) -> None:
+        drive = enabled.devices[1]
+        enabled.cycles(150)
+        drive.objects[0x6007, 0].value = 0
+        drive._enter(state)
+        drive._send(0x700 + drive.node, bytes([state]))
+        enabled.bus.faults.add("B drop sdo-request")
+        assert "left NMT operational" in enabled.last_fault(1)
+        enabled.bus.faults.clear()
+        states: list[PowerState] = []
+        control = drive._control
+
+        def controlled(entry: ObjectEntry, old: int) -> None:
+            control(entry, old)
+            states.append(drive.state)
+
+        drive.objects.on_write(0x6040, controlled)
+        enabled.drives.close()
+        assert states[0] is P.QUICK_STOP_ACTIVE
+        assert drive.state is P.SWITCH_ON_DISABLED
+
     def test_a_full_queue_is_told_once_and_stops_first_what_must_stop(self, enabled: Rig) -> None:
         enabled.bus.broken = True
         assert "txqueuelen" in enabled.cycle().warnings[0]

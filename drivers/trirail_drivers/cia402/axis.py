@@ -384,11 +384,16 @@ class Cia402Axis(Axis):
         self.pdo_silent = self.left_operational and self.configured and state != canopen_frames.OPERATIONAL
 
     def leave_operational(self) -> None:
-        """Record that the drive no longer receives PDOs; its state is unknown until it answers by SDO."""
+        """Record that the drive no longer receives PDOs.
+
+        Its power state is unknown until it answers by SDO. A drive that had power counts as "switched on" until then:
+        it no longer follows setpoints, but neither has it reported that it is without power.
+        """
         self._operational = False
         self.left_operational = True
         self.outputs_sent = NOTHING_SENT  # the drive may have missed the last ones
-        self.state = PowerState.NOT_READY_TO_SWITCH_ON
+        if self.state is PowerState.OPERATION_ENABLED:
+            self.state = PowerState.SWITCHED_ON
 
     @property
     def has_missed_start(self) -> bool:
