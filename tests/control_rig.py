@@ -79,6 +79,8 @@ class PerfectDrives:
         """Tell where the sliders are."""
         return Feedback(self._position, self._state, None, inputs=self.inputs)
 
+    observe = read
+
     def write(self, position: Triple, velocity: Triple) -> None:
         """Take setpoints, as from the next SYNC on."""
         self._due = self._due[1], position

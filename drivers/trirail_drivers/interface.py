@@ -194,6 +194,12 @@ class DriveGroup(Protocol):
     def read(self) -> Feedback:
         """Handle every frame that has arrived, and return the feedback."""
 
+    def observe(self) -> Feedback:
+        """Do the same as `read`, but do not stop the drives, whatever they report, and send no command.
+
+        The states in the following feedback are those that the drives report themselves, also without `sync`.
+        """
+
     def write(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], which the drives apply at the next SYNC.
 

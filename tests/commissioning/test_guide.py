@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import itertools
 import json
-import math
 import random
 import re
 from collections.abc import Callable, Sequence
@@ -27,6 +26,7 @@ from trirail.commissioning.report import CommissioningReport, ReportFile, StepRe
 from trirail.commissioning.steps import Steps
 from trirail.config import SIM, Config, load
 from trirail_drivers import config
+from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.protocols import CIA402
 from trirail_drivers.simulated import SimulatedBus, SimulatedDrive
@@ -359,24 +359,35 @@ def test_a_drive_that_does_not_answer_is_named(tmp_path: Path) -> None:
     assert run.of("setup").verdict == "skipped"
 
 
+def lacking(folder: Path, *objects: str) -> Config:
+    """Drives without objects that protect a robot, which the configuration accepts."""
+    eds = folder / f"without {' '.join(objects)}.eds"
+    sections = re.split(r"(?m)^(?=\[)", SERVO.read_text(encoding="utf-8"))
+    eds.write_text("".join(each for each in sections if each[1:5] not in objects), encoding="utf-8")
+    return with_drives(ROBOT, eds=str(eds), accept_without=objects)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_drive_without_a_watch_on_sync_is_told_from_one_without_any(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     others = "".join(set(NAMES) - {name})
     skip = ["by hand", f"(drive|Drive) [{others}]"]
-    monkeypatch.setattr(SimulatedDrive, "sync_timeout", lambda self: math.inf)
-    run = Run(tmp_path, person=Beside(skip))
+    run = Run(tmp_path, lacking(tmp_path, "1006"), person=Beside(skip))
     watch = run.of("watchdog", name)
     assert watch.verdict == "ok", watch
     assert "8130" in watch.words[0]
     assert "monitoring heartbeats" in watch.words[1]
 
-    for name_of_report in ("report.json", "report.txt"):
-        (tmp_path / name_of_report).unlink()
-    monkeypatch.setattr(SimulatedDrive, "_master_lost", lambda self: None)
-    run = Run(tmp_path, person=Beside(skip))
-    found(run, "watchdog", name, f"drive {name} kept its power without SYNC and heartbeat", "1006h")
+    kept = f"drive {name} kept its power without SYNC and heartbeat"
+    for robot, words in (
+        (lacking(tmp_path, "1006", "6007"), f"{kept}: drive {name}: emergency 0x8130"),  # it only reports the loss
+        (lacking(tmp_path, "1006"), f"{kept}: operation enabled"),
+    ):
+        for name_of_report in ("report.json", "report.txt"):
+            (tmp_path / name_of_report).unlink()
+        found(Run(tmp_path, robot, person=Beside(skip)), "watchdog", name, words, "1006h")
+        monkeypatch.setattr(SimulatedDrive, "_master_lost", lambda self: None)
 
 
 # ---------------------------------------------------------------------- what it promises

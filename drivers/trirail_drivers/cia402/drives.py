@@ -239,6 +239,19 @@ class Cia402(Driver[Cia402Axis]):
             self._poll(now)
         return self._feedback(self._wire.warnings())
 
+    def observe(self) -> Feedback:
+        """Handle every frame that has arrived, request the statuswords, and return the feedback; see
+        interface.DriveGroup.
+        """
+        now = self._clock()
+        self._wire.receive(now)
+        for axis in self._axes:
+            if now >= axis.poll_due:  # neither an EMCY nor an NMT state shows whether a drive has power
+                self._enable_sdo(axis)
+                self._ask(axis, canopen_frames.STATUSWORD_UPLOAD)
+                axis.poll_due = now + canopen_frames.POLL_PERIOD
+        return self._feedback()
+
     def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
         a, b, c = self._axes
         return Feedback(
@@ -512,13 +525,15 @@ class Cia402(Driver[Cia402Axis]):
         return self._wire.send(frame)
 
     def _send_word_by_sdo(self, axis: Cia402Axis, word: int) -> None:
-        """Send a controlword by SDO, which also works in NMT pre-operational. A node in NMT stopped is first switched
-        to pre-operational.
-        """
-        if axis.stopped:
-            self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
+        """Send a controlword by SDO, which also works in NMT pre-operational."""
+        self._enable_sdo(axis)
         data = canopen_frames.CONTROLWORD_DOWNLOAD + canopen_frames.CONTROLWORD.pack(word) + bytes(2)
         self._ask(axis, data)
+
+    def _enable_sdo(self, axis: Cia402Axis) -> None:
+        """Switch a node in NMT stopped, in which it receives no SDO, to pre-operational."""
+        if axis.stopped:
+            self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
 
     def _ask(self, axis: Cia402Axis, request: bytes) -> bool:
         """Send an SDO request; return whether the bus accepted it."""

@@ -173,6 +173,11 @@ class Odrive(Driver[OdriveAxis]):
         self._check_stopped(now)
         return self._feedback(self._wire.warnings())
 
+    def observe(self) -> Feedback:
+        """Handle every frame that has arrived, and return the feedback; see interface.DriveGroup."""
+        self._wire.receive(self._clock())
+        return self._feedback()
+
     def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
         a, b, c = self._axes
         on = self._enabled

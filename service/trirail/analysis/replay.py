@@ -411,6 +411,10 @@ class _RecordedDrives:
         """Return the recorded feedback of the current cycle; before the first cycle, return that of the first cycle."""
         return self._feedback[max(0, self._row - 1)]._replace(fault=self._fault, unready=self._unready)
 
+    def observe(self) -> Feedback:
+        """See trirail_drivers.interface.DriveGroup."""
+        return self.read()
+
     @property
     def counts(self) -> tuple[Counts, Counts, Counts]:
         """Zeros: a recording contains no counts."""

@@ -218,7 +218,7 @@ class Steps:
                 reaction = bench.provoke_watchdog(3.0 * heartbeat + HOLD_TIME_S)
         except DrivesStoppedError as error:
             return Judgement("failed", (str(error),), "repeat this step"), {}
-        judgement = judge_watchdog(name, reaction.seconds, reaction.drive, reaction.message, reaction.code)
+        judgement = judge_watchdog(name, reaction.seconds, reaction.message, reaction.code)
         return judgement, {"seconds": reaction.seconds, "said": reaction.message}
 
     # All three.
