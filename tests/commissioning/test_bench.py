@@ -86,13 +86,18 @@ def test_a_drive_passes_its_watchdog_if_it_removes_its_power_by_itself(
 def test_a_drive_that_leaves_nmt_operational_with_power_is_named(state: Nmt, keeps_power: bool) -> None:
     with benched() as (rig, bench):
         drive = rig.devices[0]
-        with pytest.raises(DrivesStoppedError, match="left NMT operational") as stopped, bench.power("A"):
-            bench.wait(0.05)
-            drive.objects[0x6007, 0].value = 0
-            if keeps_power:
-                rig.keep_power(0)
-            drive._enter(state)
-            drive._send(0x700 + drive.node, bytes([state]))
-            bench.wait(0.05)
+
+        def leave() -> None:
+            with bench.power("A"):
+                bench.wait(0.05)
+                drive.objects[0x6007, 0].value = 0
+                if keeps_power:
+                    rig.keep_power(0)
+                drive._enter(state)
+                drive._send(0x700 + drive.node, bytes([state]))
+                bench.wait(0.05)
+
+        with pytest.raises(DrivesStoppedError, match="left NMT operational") as stopped:
+            leave()
         assert (drive.state is PowerState.OPERATION_ENABLED) is keeps_power
         assert ("drive A STILL HAS POWER" in str(stopped.value)) is keeps_power
