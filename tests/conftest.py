@@ -121,7 +121,7 @@ class Rig(ControlRig):
         self.sent.clear()
         super().cycle(request)
         setpoints = [sent for sent in self.sent if sent.arbitration_id >> 7 == 6]
-        self.seen.append([canopen_frames.SETPOINT.unpack(sent.data) for sent in setpoints])
+        self.seen.append([canopen_frames.SETPOINT.unpack(bytes(sent.data).ljust(8, b"\0")) for sent in setpoints])
 
     def captured(self) -> NDArray[np.float64]:
         """Return what the frames of all cycles so far have, not a number where no setpoints were sent."""

@@ -8,7 +8,8 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import cast
+from pathlib import Path
+from typing import Any, cast
 
 import can
 import canopen
@@ -18,6 +19,7 @@ import pytest
 from canopen.profiles.p402 import BaseNode402
 from conftest import Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
 from control_rig import CONFIG
+from edsfiles import make_eds
 from refusals import refusal
 from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
@@ -31,10 +33,11 @@ from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.eds import SERVO
-from trirail_drivers.cia402.homing import HomingSequence
+from trirail_drivers.cia402.homing import SETPOINT_SYNCS, HomingSequence
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
+from trirail_drivers.simulated.dictionary import ObjectEntry
 from trirail_drivers.simulated.faults import Faults
 from trirail_drivers.simulated.profile import MakersRules
 from waiting import WITHIN
@@ -234,6 +237,31 @@ def test_a_controlword_that_gets_lost_is_sent_again(rig: Rig, monkeypatch: pytes
     assert lost
     settled(rig)
     is_homed(rig)
+
+
+@pytest.mark.parametrize("method", [19, 37])
+def test_a_drive_in_mode_7_starts_its_homing_when_it_is_told_to(robots: Robots, tmp_path: Path, method: int) -> None:
+    """In mode 7, bit 4 of the controlword enables interpolation; with it, the change to mode 6 would start homing."""
+    robot = incremental(method)
+    eds = str(make_eds(tmp_path, "elmo_gold", {(0x6502, 0): 0x60}))
+    keys = {name: msgspec.structs.replace(getattr(robot.drives, name), eds=eds) for name in "ABC"}
+    rig = robots(msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, **keys)))
+    rig.enable()
+    assert modes(rig) == [7, 7, 7]
+    words: list[int] = []
+    for drive in rig.drives:
+        mode_written, word = drive._profile._mode_written, drive.objects[0x6040, 0]
+
+        def written(entry: ObjectEntry, old: int, of: Any = mode_written, word: ObjectEntry = word) -> None:
+            if entry.value == 6:
+                words.append(word.value)
+            of(entry, old)
+
+        drive.objects.on_write(0x6060, written)
+    assert isinstance(rig.command("home"), CommandDone)
+    assert rig.control.measured.feedback.homed == (True, True, True)
+    assert words == [canopen_frames.ENABLE_OPERATION] * 3
+    assert modes(rig) == [7, 7, 7]
 
 
 def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -544,6 +572,8 @@ def test_an_object_that_is_not_answered_about_is_waited_for_until_its_time_is_ov
     )
     homing = HomingSequence((a, b, c), drives, sent.append)
     homing.start()
+    assert homing.step(10.0) is None
+    a.syncs += SETPOINT_SYNCS
     for now in (10.0, 10.0 + drives.sdo_timeout - 1e-6):
         assert homing.step(now) is None
         assert a.sdo_asked == (0x6060).to_bytes(2, "little")

@@ -143,9 +143,11 @@ class HomingSequence:
             yield from self._follow_setpoints(axis)
 
     def _home(self, axis: Cia402Axis, homing: config.Homing) -> Steps:
-        axis.cyclic = False
+        axis.cyclic = axis.follows = False
+        # Bit 4 of the controlword, which enables interpolation in mode 7, starts homing in mode 6. The drive must have
+        # received a controlword without this bit before its mode changes.
+        yield from self._wait_for_syncs(axis)
         yield from self._change_mode(axis, HOMING)
-        axis.follows = False
         # The newest statusword may have been sent in another mode, in which its bits have other meanings.
         yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.seen_clear = ~axis.statusword
@@ -188,8 +190,7 @@ class HomingSequence:
         # The control loop has received this position. From now on it sends this position, as this sequence did before.
         axis.held = standing
         axis.follows = True
-        taken_up = axis.syncs + SETPOINT_SYNCS
-        yield from self._wait_until(lambda: axis.syncs >= taken_up, self._sdo_timeout, "no SYNC was sent")
+        yield from self._wait_for_syncs(axis)
         yield from self._change_mode(axis, axis.exchange.mode)
         if axis.exchange.tells_following:  # bit 12 of the newest statusword may still have its meaning in homing mode
             yield from self._sdo(axis, _READ, _STATUSWORD)
@@ -225,6 +226,11 @@ class HomingSequence:
             code = int.from_bytes(answer[4:], "little")
             raise HomingFailedError(f"object {index:04X}:00 was refused (SDO abort {code:08X})")
         return answer
+
+    def _wait_for_syncs(self, axis: Cia402Axis) -> Steps:
+        """Wait until the drive has applied the setpoint and the controlword that are written next."""
+        applied = axis.syncs + SETPOINT_SYNCS
+        yield from self._wait_until(lambda: axis.syncs >= applied, self._sdo_timeout, "no SYNC was sent")
 
     def _wait_until(self, reached: Callable[[], bool], seconds: float, otherwise: str) -> Steps:
         deadline = self._now + seconds

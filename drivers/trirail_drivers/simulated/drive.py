@@ -268,7 +268,10 @@ class SimulatedDrive(Device):
     # Writes.
 
     def _mode_changed(self) -> None:
+        """Reset homing. Some drives take the level of controlword bit 4, and start homing with the change of mode."""
         self.homing.forget()
+        if self._homes and self._profile.controlword.value & _HOMING_START:
+            self.homing.start(*self._profile.homing)
         self._publish()
 
     def _setpoint_written(self, _entry: ObjectEntry, _old: int) -> None:
