@@ -13,6 +13,8 @@ import can
 import canopen
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rigs import OFF, START, STEP, Bus, Clock, Closing, DriverRig, frame, ideal_servo
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import STANDSTILL_TIME_S
@@ -224,6 +226,31 @@ class TestConfigure:
         rig.devices[0].objects[0x6085, 0].value = 5
         rig.drives.configure(PERIOD)
         assert rig.devices[0].objects[0x6085, 0].value == 10_000_000
+
+    @given(
+        held=st.one_of(st.sampled_from((0x080, 0x081, 0x085, 0x089, 0x181)), st.integers(0x0A0, 0x0FF)),
+        off=st.booleans(),
+        read_only=st.booleans(),
+    )
+    def test_an_emcy_is_received_as_that_of_its_drive(self, held: int, off: bool, read_only: bool) -> None:
+        """`held` is the identifier that drive B, node 5, has at first, as after the set-up of another drive."""
+        rig = Rig()
+        entry = rig.devices[1].objects[0x1014, 0]
+        entry.value = entry.default = held | off << 31
+        if read_only:
+            entry._limits = None
+        if read_only and not off and held in (0x080, 0x081, 0x089, 0x181):
+            with pytest.raises(DriveError, match=f"drive [BC]: shares with (SYNC|drive .) the identifier {held:03X}h"):
+                rig.drives.configure(PERIOD)
+            return
+        rig.drives.configure(PERIOD)
+        rig.cycles(2)
+        assert entry.value == (held | off << 31 if read_only else 0x085)
+        rig.devices[1].errors.report(0x4210)
+        fault = rig.cycle().fault
+        assert (fault is None) is (read_only and off)
+        assert fault is None or fault[:3] == ("B", "emcy", 0x4210)
+        rig.drives.close()
 
     def test_homing_is_set_where_the_encoder_is_not_absolute(self, closing: Closing) -> None:
         rig = closing(Rig(changed("B", homing=HOMING)))

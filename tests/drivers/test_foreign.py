@@ -12,6 +12,7 @@ import can
 import msgspec
 import pytest
 from drivers.foreign import ForeignDrive, Habits, Truth, three
+from edsfiles import rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigs import STANDSTILL, Closing, Cycles, alike
@@ -445,14 +446,17 @@ def test_drives_whose_fixed_identifiers_are_the_same_are_refused(closing: Closin
     values = dict.fromkeys([(0x1600, 0), (0x1601, 0), (0x1A00, 0), (0x1A01, 0)], 1)
     values |= {(0x1601, 1): 0x607A_0020, (0x1A01, 1): 0x6064_0020}
     rig = closing(Rig("elmo_gold", Habits(fixed_pdos=True, values=values), rebased=False))
-    with pytest.raises(DriveError, match=r"drives A and B: both have a PDO with identifier \d+h that cannot be"):
+    with pytest.raises(DriveError, match=r"drive B: shares with drive A the identifier \d+h that cannot be"):
         rig.ready()
 
 
 @pytest.mark.parametrize("name", MAKES)
 def test_dictionaries_whose_identifiers_are_those_of_node_1(closing: Closing, name: str) -> None:
-    """They can be written; an EMCY that cannot is taken at the predefined identifier."""
-    rig = closing(Rig(name, rebased=False))
+    """They can be written; drives whose EMCYs keep one identifier are refused."""
+    if any(index == 0x1014 and access != "rw" for index, _, _, access, *_ in rows(name)):
+        with pytest.raises(DriveError, match=r"drive B: shares with drive A the identifier 081h .* \(1014, "):
+            closing(Rig(name, rebased=False)).ready()
+    rig = closing(Rig(name, Habits(access={(0x1014, 0): "rw"}), rebased=False))
     rig.ready()
     rig.enable()
     rig.go(0.1, 20)

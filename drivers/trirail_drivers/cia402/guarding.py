@@ -6,6 +6,7 @@ guarding needs remote frames, so a CAN FD bus needs the heartbeat consumer.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import can
@@ -13,11 +14,12 @@ import can
 from trirail_drivers.bus.frames import Frame, is_fd
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Differences
-from trirail_drivers.cia402.objects import title
-from trirail_drivers.cia402.sdo import INVALID, shown
+from trirail_drivers.cia402.objects import Key, title
+from trirail_drivers.cia402.sdo import INVALID, SdoRefused, shown
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.conversations import Wait
 
+_EMCY_ID: Final[Key] = 0x1014, 0
 _EMCY_BITS: Final = 0x8000_07FF
 """Bits of 1014h that contain the identifier of the EMCY, and whether the EMCY is disabled."""
 MOST_WATCHED: Final = 8
@@ -49,7 +51,7 @@ async def configure_watchdogs(drive: Differences, drives: Drives, period: int, n
         else:
             drive.lack((0x1016, 1), "it has no such object, and CAN FD has no remote frames for node guarding instead")
     await drive.ensure(0x1029, 1, 0)  # a drive without its master becomes pre-operational, so that it ignores setpoints
-    return Supervision(guarded, heard, await _emergency(drive, drives, node))
+    return Supervision(guarded, heard, await _emergency(drive, node))
 
 
 async def _watch_master(drive: Differences, master: int, period: int) -> None:
@@ -116,20 +118,33 @@ async def _answers(drive: Differences, node: int) -> bool:
     return await Wait(is_answer, client.clock() + client.timeout) is not None
 
 
-async def _emergency(drive: Differences, drives: Drives, node: int) -> int:
+async def _emergency(drive: Differences, node: int) -> int:
     """Set the predefined identifier of the drive's EMCY; return it, or the identifier that the drive uses instead."""
     remote, usual = drive.remote, canopen_frames.EMCY + node
     current = await remote.peek(0x1014)
-    if current is not None and current & _EMCY_BITS != usual and not await drive.try_ensure((0x1014, 0), usual):
-        others = {canopen_frames.EMCY + other.node for other in drives.each} | {canopen_frames.SYNC}
-        kept = shown(0x1014, 0, current)
+    if current is not None and current & _EMCY_BITS != usual and not await _move_emergency(drive, current, usual):
+        kept = f"{title(_EMCY_ID)} stays {shown(*_EMCY_ID, current)}"
         if current & INVALID:
-            drive.add_note(f"{title((0x1014, 0))} stays {kept}: its EMCY is off, so only its statusword shows faults")
-        elif current & 0x7FF in others:
-            drive.lack((0x1014, 0), f"it keeps {kept}")
+            drive.add_note(f"{kept}: its EMCY is off, so only its statusword shows faults")
         else:
-            drive.add_note(f"{title((0x1014, 0))} stays {kept}: its EMCY is received there")
+            drive.add_note(f"{kept}: its EMCY is received there")
             usual = current & 0x7FF
     if await remote.peek(0x1015):
         await drive.ensure(0x1015, 0, 0)
     return usual
+
+
+async def _move_emergency(drive: Differences, current: int, wanted: int) -> bool:
+    """Change the identifier of the drive's EMCY; return whether the drive accepts it."""
+    remote = drive.remote
+    if not current & INVALID:  # CiA 301: the identifier must not change while the EMCY exists
+        with suppress(SdoRefused):
+            await remote.write(*_EMCY_ID, current | INVALID)
+            await remote.wait_until(_EMCY_ID, lambda held: bool(held & INVALID))
+    try:
+        await drive.put(_EMCY_ID, current, wanted)
+    except SdoRefused:
+        with suppress(SdoRefused):
+            await remote.write(*_EMCY_ID, current)
+        return False
+    return True

@@ -151,26 +151,26 @@ def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
 
 
 def check_identifiers(done: Sequence[SetUp]) -> None:
-    """Raise DriveError if two PDOs have the same identifier, such as equal defaults that are fixed.
+    """Raise DriveError if PDOs, EMCYs or SYNC share an identifier, such as equal defaults that are fixed.
 
     Only unused RPDOs that stay on may share an identifier, if nobody sends it.
     """
-    owners: dict[int, str] = {}
+    owners = {canopen_frames.SYNC: "SYNC"}
     for made in done:
         for identifier in (*sorted(made.exchange.identifiers), *sorted(made.exchange.unused_tpdos)):
             if identifier in owners:
                 raise _shared_identifier(identifier, owners[identifier], made.name)
-            owners[identifier] = made.name
+            owners[identifier] = f"drive {made.name}"
     for made in done:
         for identifier in sorted(made.exchange.unused_rpdos & owners.keys()):
             raise _shared_identifier(identifier, owners[identifier], made.name)
 
 
-def _shared_identifier(identifier: int, one: str, other: str) -> DriveError:
-    whose = f"drive {one}: more than one PDO has" if one == other else f"drives {one} and {other}: both have a PDO with"
+def _shared_identifier(identifier: int, owner: str, name: str) -> DriveError:
+    shared = "more than one PDO or its EMCY has" if owner == f"drive {name}" else f"shares with {owner} the"
     return DriveError(
-        f"{whose} identifier {identifier:03X}h that cannot be changed or switched off (1400:01, 1800:01 and on); "
-        "give each PDO its own identifier with the manufacturer's tool"
+        f"drive {name}: {shared} identifier {identifier:03X}h that cannot be changed or switched off (1014, 1400:01, "
+        "1800:01 and on); give each PDO and EMCY its own identifier with the manufacturer's tool"
     )
 
 

@@ -9,7 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
+from canopen import SdoAbortedError
+
+from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.errorcontrol import ErrorControl
 from trirail_drivers.simulated.pdo import ReceivePdo, TransmitPdo
@@ -42,6 +44,12 @@ _ON_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
 """State that an OPERATIONAL device enters on a communication error, by the value of 1029h:01. With 1, it does not
 change.
 """
+
+
+def _emergency_id_written(entry: ObjectEntry, old: int) -> None:
+    """Refuse another identifier while the EMCY exists, bit 31 = 0 (CiA 301, 1014h)."""
+    if not old & _NOT_VALID and (entry.value ^ old) & ~_NOT_VALID:
+        raise SdoAbortedError(INVALID_VALUE)
 
 
 def _discard(can_id: int, data: bytes) -> None:
@@ -80,6 +88,7 @@ class Device:
         self._sync_window = self.objects.internal(0x1007, 0)
         self._on_error = self.objects.internal(0x1029, 1)
         self.objects.on_write(0x1005, self._sync_written)
+        self.objects.on_write(0x1014, _emergency_id_written)
 
     def _pdos(self, communication: int) -> list[int]:
         """Return the numbers of the PDOs that the EDS describes, counted from 0."""
