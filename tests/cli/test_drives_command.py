@@ -66,10 +66,10 @@ def test_drives_that_tell_nothing(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("drives", "save", str(tmp_path)) == 0
-    assert "drive C, node 3: 79 parameters in" in capsys.readouterr().out
+    assert "drive C, node 3: 80 parameters in" in capsys.readouterr().out
     a, b = (tmp_path / f"drive-{name}.dcf" for name in "AB")
     assert run("drives", "compare", str(a)) == 0
-    assert "0 of 79 parameters differ" in capsys.readouterr().out
+    assert "0 of 80 parameters differ" in capsys.readouterr().out
     head, section, rest = a.read_text().partition("[607C]")
     a.write_text(head + section + rest.replace("ParameterValue=0", "ParameterValue=77", 1))
     assert run("drives", "compare", str(a), "--json") == 1
@@ -107,6 +107,7 @@ def test_the_drives_that_answer_are_saved_and_the_others_named(
     assert run("drives", "save", str(tmp_path), "--config", str(tmp_path / "robot.toml"), "--json") == 1
     told = json.loads(capsys.readouterr().out)
     assert (sorted(told["drives"]), sorted(told["failed"])) == (["A", "C"], ["B"])
+    assert "need drives.A.eds" in told["drives"]["A"]["notes"][0]
     assert sorted(path.name for path in tmp_path.glob("drive-*")) == ["drive-A.dcf", "drive-C.dcf"]
 
 

@@ -232,6 +232,21 @@ def test_a_file_has_every_value_to_the_last_bit(
     assert parameter_file.read(path) == saved
 
 
+@pytest.mark.parametrize("make", MAKES)
+def test_a_drive_read_without_its_eds_is_compared_only_where_it_was_asked(make: str, tmp_path: Path) -> None:
+    with Line(make_eds(tmp_path, make)) as line:
+        parameter_file.write(tmp_path / "saved.dcf", line.save())
+        saved = parameter_file.read(tmp_path / "saved.dcf")
+        line.drives = replacement_refusal(line.drives, A=replacement_refusal(line.drives.A, eds=None))
+        again = line.save()
+        compared = parameter_file.comparable(saved, again)
+        assert compared == sorted(saved.parameters.keys() & again.parameters.keys())
+        assert parameter_file.compare(saved, again) == []
+        key = random.Random(make).choice(compared)
+        other(line.objects[key], random.Random(make))
+        assert [each.key for each in parameter_file.compare(saved, line.save())] == [key]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [

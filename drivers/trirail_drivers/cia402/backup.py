@@ -199,7 +199,9 @@ async def _save(remote: Remote, drive: Drive, progress: _Progress) -> SavedParam
                 read[key] = parameter(variable.data_type, content, variable.qualname)
             else:
                 unread[key] = "it is empty, which no file can hold"
-    return SavedParameters(drive_origin, read, unread, remote.client.od, unanswered=frozenset(unanswered))
+    # The built-in EDS describes only a few objects, and without its manufacturer's EDS a drive may have any others.
+    complete = drive.eds is not None
+    return SavedParameters(drive_origin, read, unread, remote.client.od, complete, frozenset(unanswered))
 
 
 async def _repeat(request: Callable[[], Coroutine[Any, Any, T]]) -> T:

@@ -77,7 +77,10 @@ class SavedParameters:
     objects: ObjectDictionary = field(default_factory=ObjectDictionary, compare=False, repr=False)
     """All objects of the drive, for other programs that open the file."""
     complete: bool = field(default=True, compare=False)
-    """Whether the drive certainly lacks every object that is not listed; False for a DCF, which may list only some."""
+    """Whether the drive certainly lacks every object that is not listed.
+
+    False for a DCF, which may list only some, and for a drive that was read without its manufacturer's EDS.
+    """
     unanswered: frozenset[Key] = field(default=frozenset(), compare=False)
     """Parameters without a value because the drive did not answer."""
 

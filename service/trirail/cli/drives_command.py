@@ -121,12 +121,18 @@ def save(
             failed[name] = str(error)
             del read[name]
     ok = not failed and not any(saved.unanswered for saved in read.values())
+    notes = {
+        name: f"named from the built-in servo.eds: the manufacturer's own objects need drives.{name}.eds"
+        for name in read
+        if getattr(settings.drives, name).eds is None
+    }
     if json:
         files = {
             name: {
                 "file": str(paths[name]),
                 "parameters": len(saved.parameters),
                 "unread": {_named(key): why for key, why in saved.unread.items()},
+                "notes": [notes[name]] if name in notes else [],
             }
             for name, saved in read.items()
         }
@@ -140,10 +146,8 @@ def save(
             reasons.setdefault(why, []).append(_named(key))
         for why, objects in reasons.items():
             terminal.print_line(f"  {len(objects)} could not be read: {_abbreviate(objects)}: {why}")
-        if getattr(settings.drives, name).eds is None:
-            terminal.print_line(
-                f"  named from the built-in servo.eds: the manufacturer's own objects need drives.{name}.eds"
-            )
+        if name in notes:
+            terminal.print_line(f"  {notes[name]}")
     for words in failed.values():
         terminal.print_error(words)
     return 0 if ok else 1
