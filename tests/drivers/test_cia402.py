@@ -512,7 +512,7 @@ class TestFaults:
 
     def test_a_full_queue_is_told_once_and_stops_first_what_must_stop(self, enabled: Rig) -> None:
         enabled.bus.broken = True
-        assert "txqueuelen" in enabled.cycle().warnings[0]
+        assert "ip link set simulated drives txqueuelen 100" in enabled.cycle().warnings[0]
         assert enabled.cycle().warnings == ()
         enabled.drives.quick_stop()
         enabled.bus.broken = False

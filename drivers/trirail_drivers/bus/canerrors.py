@@ -29,7 +29,7 @@ _CLASSES = {
     0x020: "no acknowledgement from any other node; check that the drives are powered and have the same bitrate",
     BUS_OFF: (
         "bus-off: 256 transmit errors, the controller has left the bus; check cable, termination and bitrate, then "
-        "restart the interface: ip link set DEV down, ip link set DEV up"
+        "restart the interface: ip link set {interface} down, ip link set {interface} up"
     ),
     0x080: "bus error",
     RESTARTED: "the controller was restarted after bus-off",
@@ -104,8 +104,11 @@ class ErrorReport(NamedTuple):
     text: str
 
 
-def decode_error_frame(kind: int, data: bytes | bytearray) -> ErrorReport:
-    """Decode an error frame's identifier and data; a frame that is not in SocketCAN's coding becomes a warning."""
+def decode_error_frame(kind: int, data: bytes | bytearray, bus: str) -> ErrorReport:
+    """Decode an error frame's identifier and data; a frame that is not in SocketCAN's coding becomes a warning.
+
+    `bus` is the name of the bus, as in `explain`.
+    """
     if len(data) != _LENGTH:
         return ErrorReport(Severity.WARNING, f"error frame {kind:X} in the interface's own coding")
     parts = [words for bit, words in _CLASSES.items() if kind & bit]
@@ -117,7 +120,7 @@ def decode_error_frame(kind: int, data: bytes | bytearray) -> ErrorReport:
         parts.append(f"transceiver: {_WIRES.get(data[4], 'unspecified error')}")
     if kind & _LOST_ARBITRATION:
         parts.append("arbitration lost")
-    text = "; ".join(parts) or f"error frame {kind:X}"
+    text = "; ".join(parts).format(interface=_interface_of(bus)) or f"error frame {kind:X}"
     if kind & BUS_OFF:
         return ErrorReport(Severity.FAULT, text)
     errors = kind & ~(_LOST_ARBITRATION | 0x200)  # 200h, CAN_ERR_CNT: the data has error counters
@@ -132,18 +135,21 @@ def queue_is_full(error: Exception) -> bool:
     return number in (errno.ENOBUFS, errno.EAGAIN) or (isinstance(error, can.CanOperationError) and number is None)
 
 
-def explain(error: Exception, *, sending: bool = True) -> str:
-    """Return the reason why a frame could not be sent or received, with the remedy."""
-    reason = " ".join(str(error).split())
+def explain(error: Exception, bus: str, *, sending: bool = True) -> str:
+    """Return the reason why a frame could not be sent or received, with the remedy.
+
+    `bus` is the name of the bus: that of its interface, or python-can's `channel_info`.
+    """
+    reason, interface = " ".join(str(error).split()), _interface_of(bus)
     if sending and queue_is_full(error):
         return (
             f"{reason}: the transmit queue is full, because no node acknowledges (check the power of the drives, "
-            "cable, "
-            f"termination, bitrate) or it is shorter than a cycle's frames: ip link set DEV txqueuelen 100"
+            f"cable, termination, bitrate) or it is shorter than a cycle's frames: ip link set {interface} "
+            "txqueuelen 100"
         )
     match error_number(error):
         case errno.ENETDOWN:
-            return f"{reason}: the interface is down; bring it up: ip link set DEV up"
+            return f"{reason}: the interface is down; bring it up: ip link set {interface} up"
         case errno.ENODEV | errno.ENXIO:
             return f"{reason}: the interface no longer exists; check that the adapter is plugged in"
         case errno.EPIPE | errno.ECONNRESET:
@@ -159,6 +165,12 @@ def error_number(error: BaseException | None) -> int | None:
             return int(number)
         error = error.__cause__
     return None
+
+
+def _interface_of(bus: str) -> str:
+    """Return the name of a bus's interface, which python-can puts into quotes: socketcan channel 'can0'."""
+    quoted = bus.split("'")
+    return quoted[1] if len(quoted) > 2 else bus
 
 
 def _violation(kind: int, location: int) -> str:

@@ -118,7 +118,7 @@ class Wire:
             try:
                 self._use(outcome)
             except (can.CanError, OSError) as error:
-                self.lose(f"cannot receive: {canerrors.explain(error)}")
+                self.lose(f"cannot receive: {canerrors.explain(error, self._name)}")
 
     def _end_trial(self) -> None:
         self.down, self._trial, self._awaits_frame = "", None, False
@@ -139,7 +139,7 @@ class Wire:
         self.fail(DriveFault("", "bus", 0, text))
 
     def _down_text(self, reason: str) -> str:
-        return shortened(f"CAN bus {self._name} is down: {reason}".replace("DEV", self._name))
+        return shortened(f"CAN bus {self._name} is down: {reason}")
 
     def close(self) -> None:
         """Close the bus."""
@@ -214,7 +214,7 @@ class Wire:
 
     def _handle_send_error(self, error: Exception) -> None:
         """Turn a failed send into a warning, a fault or a lost bus."""
-        reason = f"cannot send: {canerrors.explain(error)}"
+        reason = f"cannot send: {canerrors.explain(error, self._name)}"
         if not canerrors.queue_is_full(error):
             self.lose(reason)
         elif self._unsent_cycles < UNSENT_CYCLES - 1:
@@ -234,7 +234,7 @@ class Wire:
                     return
                 self._dispatch(*received, now)
         except (can.CanError, OSError) as error:
-            self.lose(f"cannot receive: {canerrors.explain(error, sending=False)}", dead=False)
+            self.lose(f"cannot receive: {canerrors.explain(error, self._name, sending=False)}", dead=False)
 
     def wait(self, seconds: float, clock: Clock) -> None:
         """Wait up to `seconds` for a frame and handle it. Not for use in the cycle. Raises can.CanError or OSError."""
@@ -244,7 +244,7 @@ class Wire:
 
     def _dispatch(self, identifier: int, data: bytearray, now: float) -> None:
         if identifier & ERROR:
-            self._handle_error_frame(canerrors.decode_error_frame(identifier & EXTENDED_BITS, data))
+            self._handle_error_frame(canerrors.decode_error_frame(identifier & EXTENDED_BITS, data, self._name))
             return
         self.traffic += self._frames_ns[min(len(data), MOST_DATA)]
         if self._trial is not None:  # a received frame proves that the bus is working again

@@ -139,7 +139,7 @@ def receive(bus: can.BusABC, seconds: float) -> can.Message | None:
     except (can.CanError, OSError) as error:
         raise BusError(f"cannot receive on {bus.channel_info}: {error}; check that the interface is up") from error
     if frame is not None and frame.is_error_frame:
-        report = canerrors.decode_error_frame(frame.arbitration_id, frame.data)
+        report = canerrors.decode_error_frame(frame.arbitration_id, frame.data, str(bus.channel_info))
         if report.severity is canerrors.Severity.FAULT:
             raise BusError(f"cannot use {bus.channel_info}: {report.text}")
     return frame
