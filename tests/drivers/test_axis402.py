@@ -166,11 +166,12 @@ def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -
     assert axis.left_operational
     axis.on_heartbeat(OPERATIONAL, T)
     assert not axis.pdo_silent  # somebody else has started it: its statuswords come by themselves
-    axis.on_heartbeat(PRE_OPERATIONAL, T)
     axis.clear_faults(T + 5.0)
-    assert not axis.left_operational  # it is started once
-    axis.on_heartbeat(PRE_OPERATIONAL, T + 5.0)  # sent before it was
-    assert not axis.left_operational
+    assert axis.find_fault(T + 5.0, OFF) is not None  # until its set-up has been checked: it may have restarted
+    axis.rejoin(axis.exchange, axis.units, T + 5.0, homed=True)
+    axis.clear_faults(T + 5.0)
+    axis.on_heartbeat(PRE_OPERATIONAL, T + 5.0)  # sent before it was started
+    assert axis.configured
     assert not axis.pdo_silent
     assert axis.find_fault(T + 5.299, OFF) is None  # its statuswords have time anew
     axis.on_heartbeat(OPERATIONAL, T + 5.0)

@@ -44,6 +44,12 @@ SCALE = scale_of("A", CONFIG.A)
 HOMING = Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5)
 
 
+WATCHED = (0x1006, 0x1016, 0x6007, 0x605A, 0x605E, 0x6065, 0x6066, 0x6085)
+"""Objects of the protections that a set-up gives a drive."""
+STORABLE = (*WATCHED, *range(0x1400, 0x1402), *range(0x1600, 0x1602), *range(0x1800, 0x1802), *range(0x1A00, 0x1A02),
+            0x6060, 0x60C2)  # fmt: skip
+
+
 def changed(name: str, **keys: object) -> Drives:
     """The configuration, with one drive's keys changed."""
     return msgspec.structs.replace(CONFIG, **{name: msgspec.structs.replace(getattr(CONFIG, name), **keys)})
@@ -478,13 +484,51 @@ class TestFaults:
         ready.drives.reset()
         assert ready.cycles(20).fault is None
 
-    def test_drive_that_left_operational_is_started_again_by_reset(self, ready: Rig) -> None:
+    @pytest.mark.parametrize("command", [canopen_frames.NMT_PRE_OPERATIONAL, 2])
+    def test_drive_that_left_operational_is_configured_again(self, ready: Rig, command: int) -> None:
+        """Another master stops it or makes it pre-operational; its set-up is checked, and a reset is enough."""
         ready.cycles(150)
-        ready.bus.send(frame(0, bytes([128, 9])))
+        ready.bus.send(frame(0, bytes([command, 9])))
         ready.found("silent", within=3)
-        ready.cycles(150)
+        reason = ready.cycles(130).unready[2]
+        assert reason is not None
+        assert "drive C is not in NMT operational: configuring" in str(reason)
+        feedback = ready.cycles(1000)
+        assert (feedback.unready, ready.devices[2].nmt) == ((None,) * 3, Nmt.OPERATIONAL)
         ready.drives.reset()
         assert ready.cycles(200).fault is None
+        ready.enable()
+
+    @given(stored=st.sets(st.sampled_from(STORABLE)), homes=st.booleans(), boots_late=st.integers(0, 40))
+    def test_a_drive_whose_boot_up_message_is_lost_is_configured_again(
+        self, stored: set[int], homes: bool, boots_late: int
+    ) -> None:
+        """It sends heartbeats after its restart, since it has `stored` their period and perhaps other objects."""
+        rig = Rig(changed("A", homing=HOMING) if homes else CONFIG)
+        rig.drives.configure(PERIOD)
+        drive = rig.devices[0]
+        axis = rig.drives._axes[0]
+        axis.homed = True
+        configured = {key: entry.value for key, entry in drive.objects._entries.items() if entry.writable}
+        for (index, _), entry in drive.objects._entries.items():
+            if index in (0x1017, *stored):
+                entry.default = entry.value
+        rig.enable()
+        rig.cycles(50, START)
+        drive.restart(rig.clock.now)
+        rig.bus._arrived.clear()
+        drive._error_control._heartbeat_due = rig.clock.now + 1e-3 * boots_late
+        feedback = rig.cycles(1000)
+        assert feedback.fault is not None
+        assert not any(feedback.unready)
+        rig.drives.reset()
+        assert rig.cycles(100).fault is None
+        assert {key: drive.objects[key].value for key in configured if key[0] in WATCHED} == {
+            key: value for key, value in configured.items() if key[0] in WATCHED
+        }
+        assert rig.cycle().homed == (not homes, True, True)
+        rig.enable()
+        rig.drives.close()
 
     @pytest.mark.parametrize("state", [Nmt.PRE_OPERATIONAL, Nmt.STOPPED])
     def test_a_drive_that_left_operational_with_power_has_its_ramp_when_the_driver_closes(
@@ -655,28 +699,26 @@ class TestClose:
 
 
 @pytest.mark.parametrize("refused", [True, False])
-def test_a_node_that_missed_its_start_is_started_again(ready: Rig, refused: bool) -> None:
-    """The frame waits while the queue is full. If the node itself has missed it, the next reset sends it again."""
+def test_a_node_that_missed_its_start_is_configured_again(ready: Rig, refused: bool) -> None:
+    """The start at the end of a set-up is lost, or does not fit into the queue."""
     ready.cycles(5)
-    a = ready.devices[0]
-    a._enter(Nmt.PRE_OPERATIONAL)
-    ready.cycles(200)
-    send = ready.bus.send
+    a, send = ready.devices[0], ready.bus.send
 
     def lose(message: can.Message, timeout: float | None = None) -> None:
-        if message.arbitration_id != canopen_frames.NMT:
+        if message.arbitration_id != canopen_frames.NMT or message.data[0] != canopen_frames.NMT_START:
             send(message, timeout)
         elif refused:
             raise can.CanOperationError("No buffer space available", errno.ENOBUFS)
 
     vars(ready.bus).update(send=lose)
-    ready.drives.reset()
-    ready.cycle()
+    a._enter(Nmt.PRE_OPERATIONAL)
+    ready.cycles(1000)
+    assert a.nmt is Nmt.PRE_OPERATIONAL
     vars(ready.bus).update(send=send)
-    if not refused:
-        ready.cycles(1000)
-        assert a.nmt is Nmt.PRE_OPERATIONAL
-        ready.bus.late = 0  # from now on, an answer is read one cycle later
+    for late in (None, 0):  # with 0, an answer is read one cycle later
+        ready.bus.late = late
         ready.drives.reset()
-    assert ready.cycles(300).fault is None
+        feedback = ready.cycles(1000)
+        assert not any(feedback.unready)
     assert a.nmt is Nmt.OPERATIONAL
+    assert feedback.fault is None

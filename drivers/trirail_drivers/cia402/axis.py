@@ -89,7 +89,7 @@ class Cia402Axis(Axis):
         self.pdo_silent = False
         """Whether the last heartbeat showed a state without PDOs, so that the statusword must be requested."""
         self.left_operational = False
-        """Whether the drive has left NMT operational and has not been started again."""
+        """Whether the drive has left NMT operational, and its set-up has not been checked since then."""
         self.sdo_asked: bytes | None = None
         """Index of the object whose SDO answer is pending, little-endian."""
         self.unanswered = 0
@@ -102,8 +102,6 @@ class Cia402Axis(Axis):
         """Time of the next statusword request, and time until which the error register may arrive [s]."""
         self.register_wanted = False
         """Whether the drive's error register 1001h must be requested."""
-        self.start_wanted = False
-        """Whether the drive must be switched to NMT operational, after a reset."""
         self._operational = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
         self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfterStop()
@@ -120,6 +118,18 @@ class Cia402Axis(Axis):
         self.outputs_sent = NOTHING_SENT
         self.velocity_per_metre = units.velocity_per_metre
         self.position_at, self.velocity_at, self.controlword_at = map(exchange.setpoints.offset, range(3))
+
+    @property
+    def configured(self) -> bool:
+        """Whether the drive's set-up is still valid. It may be lost if the drive has left NMT operational, since the
+        drive may have restarted and its boot-up message may have been lost.
+        """
+        return super().configured and not self.left_operational
+
+    @property
+    def takes_outputs(self) -> bool:
+        """Whether digital outputs are sent to the drive: it is configured, or has only left NMT operational."""
+        return self.configured or self.left_operational
 
     def forget_power_state(self) -> None:
         """Forget the last power state, and stop looking for positions of another node, since a new set-up begins."""
@@ -144,7 +154,7 @@ class Cia402Axis(Axis):
     def rejoin(self, exchange: process_data.Exchange, units: Units, now: float, *, homed: bool) -> None:
         """Let the drive take part in the cycle again after a set-up in the background."""
         self.set_up(exchange, units)
-        self.restarted = self.silent = self.left_operational = self.pdo_silent = self.start_wanted = False
+        self.restarted = self.silent = self.left_operational = self.pdo_silent = False
         self.stopped = self._operational = False
         self.powered_up = self.has_followed = self._followed = self.has_setpoint = False
         self.mode.shown, self.cyclic, self.follows, self.held, self.mode_bits = exchange.mode_shown, True, True, None, 0
@@ -189,7 +199,7 @@ class Cia402Axis(Axis):
         settled = self.state is wanted and wanted is not PowerState.QUICK_STOP_ACTIVE
         no_fault = self.event is None and not self.error_code and self.reset_until == -math.inf
         lives = self._operational and not (
-            self.stopped or self.left_operational or self.pdo_silent or self.register_wanted or self.start_wanted
+            self.stopped or self.left_operational or self.pdo_silent or self.register_wanted
         )
         asked = self.sdo_asked is not None or self.exchange.polled or self.awaits_mode
         follows = wanted is PowerState.OPERATION_ENABLED and self.exchange.tells_following
@@ -381,7 +391,7 @@ class Cia402Axis(Axis):
             self.leave_operational()
             self.note_fault("state", 0, f"has left NMT operational and is {_NMT_STATES.get(state, f'in {state:02X}')}")
             self._answers_after.begin(self.event)
-        self.pdo_silent = self.left_operational and self.configured and state != canopen_frames.OPERATIONAL
+        self.pdo_silent = self.left_operational and not self.silent and state != canopen_frames.OPERATIONAL
 
     def leave_operational(self) -> None:
         """Record that the drive no longer receives PDOs.
@@ -410,12 +420,8 @@ class Cia402Axis(Axis):
         self._answers_after.forget()
         if self.configured:
             self.event = None
-        if self.state is PowerState.FAULT or self.left_operational:  # the latter cannot report a fault
+        if self.state is PowerState.FAULT:
             self.reset_until = now + RESET_TIME
-        if self.left_operational:
-            self.left_operational = False
-            self.clear_missed()
-            self.status_heard = now
         if self.error_code and self.state not in _IN_FAULT:
             # After an EMCY without a following "error reset", only the error register shows whether the error is over.
             self.register_wanted = True

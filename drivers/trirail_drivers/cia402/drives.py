@@ -283,7 +283,6 @@ class Cia402(Driver[Cia402Axis]):
 
     def _write_setpoints(self, position: Triple, velocity: Triple) -> None:
         late = self._clock() - self._synced > self._period
-        self._start_nodes()
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._command()  # if frames have to wait, stop commands are sent first
         frames = self._tables.setpoints
@@ -320,7 +319,7 @@ class Cia402(Driver[Cia402Axis]):
             silent = axis.missed >= self._drives.missed_positions
             if silent if by_pdo else axis.forget_lost_requests(now):
                 axis.outputs_sent = NOTHING_SENT
-            if not (outputs_pending(axis) and axis.configured):
+            if not (outputs_pending(axis) and axis.takes_outputs):
                 continue
             if by_pdo:
                 put_outputs(axis, self._tables.outputs.frames[number, DATA_AT:])
@@ -337,7 +336,7 @@ class Cia402(Driver[Cia402Axis]):
     def _make_outputs_safe(self) -> None:
         """Write the safe values of the outputs and wait for the answers. SDOs also work in NMT pre-operational."""
         self.set_outputs([axis.io.safe for axis in self._axes])
-        asked = [axis for axis in self._axes if axis.has_outputs and axis.configured]
+        asked = [axis for axis in self._axes if axis.has_outputs and axis.takes_outputs]
         self._await_answers(asked)  # a server handles one request at a time (CiA 301)
         for axis in asked:
             word = canopen_frames.OUTPUTS.pack(axis.outputs | axis.outputs_kept)
@@ -451,23 +450,13 @@ class Cia402(Driver[Cia402Axis]):
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._start_stop_timer("reset")
         for axis in self._axes:
-            if not axis.configured:
-                continue
-            if axis.has_missed_start:
+            if axis.configured and axis.has_missed_start:
                 axis.leave_operational()
-            axis.start_wanted |= axis.left_operational
-            axis.clear_faults(now)
-        if self._leaves_room(len(self._axes) + sum(axis.start_wanted + axis.register_wanted for axis in self._axes)):
-            self._start_nodes()
+            if axis.configured:
+                axis.clear_faults(now)
+        if self._leaves_room(len(self._axes) + sum(axis.register_wanted for axis in self._axes)):
             self._ask_for_registers()
             self._command()
-
-    def _start_nodes(self) -> None:
-        """Start the nodes that a reset returns to NMT operational. Only then do they receive controlwords by PDO."""
-        for axis in self._axes:
-            if axis.start_wanted:  # the set-up is still valid: only a restarted drive needs a new one
-                axis.start_wanted = not self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
-                axis.outputs_sent = NOTHING_SENT  # the drive may have missed outputs, or changed them by itself
 
     def _ask_for_registers(self) -> None:
         for axis in self._axes:

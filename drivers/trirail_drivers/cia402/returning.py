@@ -78,8 +78,13 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         axis = self.axis
         if axis.restarted:
             return False
-        unheard = axis.silent or axis.left_operational
-        return (axis.state in HAS_POWER and (stopping or not axis.silent)) or (unheard and stopping)
+        return stopping if axis.silent else axis.state in HAS_POWER
+
+    @property
+    def cause(self) -> str:
+        """Reason for a new set-up, as the drive has reported it; "" if it has fallen silent."""
+        left = self.axis.left_operational and not self.axis.silent
+        return "is not in NMT operational" if left else super().cause
 
     @property
     def settled(self) -> bool:

@@ -114,6 +114,11 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
         """Whether a restarted drive is ready to receive requests."""
         return True
 
+    @property
+    def cause(self) -> str:
+        """Reason for a new set-up, as the drive has reported it; "" if it has fallen silent."""
+        return "has restarted" if self.axis.restarted else ""
+
     def has_answered(self, now: float) -> bool:  # noqa: ARG002
         """Whether the cycle's last request has been answered, or has timed out at time `now` [s]."""
         return True
@@ -146,9 +151,9 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
         if self.refused:
             return Unready(self.refused)
         answered = self.client.answered if self.client is not None else 0
-        if not answered and not axis.restarted:
+        reason = self.cause or ("answers again" if answered else "")
+        if not reason:
             return Unready(f"{name} does not answer")
-        reason = "has restarted" if axis.restarted else "answers again"
         if blocked:
             return Unready(f"{name} {reason}: the drive is configured once no drive has power")
         return Unready(f"{name} {reason}: {self.work}", answered, self.requests, self.counted)

@@ -25,8 +25,8 @@ REST_CHECK_S: Final = 0.05
 """Time for which the sliders are observed before power is applied [s]."""
 RESET_TIMEOUT_S: Final = 1.0
 """Time within which a fault must clear after a reset [s]."""
-MAX_RESETS: Final = 2
-"""Maximum number of resets. A drive that has left NMT operational shows this only by its next heartbeat."""
+SETUP_TIMEOUT_S: Final = 10.0
+"""Longest wait for drives that are configured again after a fault [s]."""
 FEEDBACK_DELAY_CYCLES: Final = 2
 """Number of SYNCs from a written setpoint to the first position that shows its effect.
 
@@ -231,12 +231,14 @@ class Bench:
 
     def clear_fault(self) -> None:
         """Reset a fault, if there is one. Raises DrivesStoppedError if the fault persists."""
-        for _ in range(MAX_RESETS):
-            if self.feedback.fault is None:
-                return
-            self._drives.reset()
-            self.wait(RESET_TIMEOUT_S)
-        if (fault := self.feedback.fault) is not None:
+        if self.feedback.fault is None:
+            return
+        self.wait(self.config.drives.heartbeat)  # a drive shows by its heartbeat that it is not in NMT operational
+        for _ in range(round(SETUP_TIMEOUT_S / self.period)):
+            if not any(self.cycle().unready):
+                break
+        self._drives.reset()
+        if (fault := self.wait(RESET_TIMEOUT_S).fault) is not None:
             raise DrivesStoppedError(f"the fault cannot be reset: {fault.message}")
 
     def _has_power(self, feedback: Feedback) -> bool:
