@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rigs import OFF, START, STEP, Bus, Clock, Closing, DriverRig, frame, ideal_servo
-from trirail_drivers.cia402 import canopen_frames
+from trirail_drivers.cia402 import backup, canopen_frames, inspection
 from trirail_drivers.cia402.axis import STANDSTILL_TIME_S
 from trirail_drivers.cia402.drives import REPEAT_AFTER, Cia402
 from trirail_drivers.cia402.eds import SERVO
@@ -257,6 +257,26 @@ class TestConfigure:
         assert (fault is None) is (read_only and off)
         assert fault is None or fault[:3] == ("B", "emcy", 0x4210)
         rig.drives.close()
+
+    @pytest.mark.parametrize("guarded", [0x00, 0x80])
+    def test_a_drive_in_nmt_stopped_is_not_called_absent(self, guarded: int) -> None:
+        """`guarded` is the toggle bit of an answer to node guarding."""
+        rig = Rig()
+        b = rig.devices[1]
+        b._enter(Nmt.STOPPED)
+        b.objects[0x1017, 0].value = 10
+        b._error_control._heartbeat_due = rig.clock.now
+        send = b._transmit
+        b._transmit = lambda can_id, data: send(can_id, bytes([data[0] | guarded]) if can_id == 0x705 else data)
+        ends = inspection.inspect(rig.bus, CONFIG, PERIOD, rig.clock, apply=False)
+        assert [each["refused"].partition(";")[0] for each in ends] == [
+            "",
+            "drive B: is in NMT stopped, in which it answers no requests",
+            "",
+        ]
+        (saved,) = backup.save(rig.bus, CONFIG, rig.clock, ["B"]).values()
+        assert "is in NMT stopped" in str(saved)
+        rig.drives.configure(PERIOD)  # the set-up of the service makes it pre-operational
 
     def test_homing_is_set_where_the_encoder_is_not_absolute(self, closing: Closing) -> None:
         rig = closing(Rig(changed("B", homing=HOMING)))

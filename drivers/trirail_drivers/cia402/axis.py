@@ -127,7 +127,7 @@ class Cia402Axis(Axis):
         return super().configured and not self.left_operational
 
     @property
-    def takes_outputs(self) -> bool:
+    def accepts_outputs(self) -> bool:
         """Whether digital outputs are sent to the drive: it is configured, or has only left NMT operational."""
         return self.configured or self.left_operational
 

@@ -319,7 +319,7 @@ class Cia402(Driver[Cia402Axis]):
             silent = axis.missed >= self._drives.missed_positions
             if silent if by_pdo else axis.forget_lost_requests(now):
                 axis.outputs_sent = NOTHING_SENT
-            if not (outputs_pending(axis) and axis.takes_outputs):
+            if not (outputs_pending(axis) and axis.accepts_outputs):
                 continue
             if by_pdo:
                 put_outputs(axis, self._tables.outputs.frames[number, DATA_AT:])
@@ -336,7 +336,7 @@ class Cia402(Driver[Cia402Axis]):
     def _make_outputs_safe(self) -> None:
         """Write the safe values of the outputs and wait for the answers. SDOs also work in NMT pre-operational."""
         self.set_outputs([axis.io.safe for axis in self._axes])
-        asked = [axis for axis in self._axes if axis.has_outputs and axis.takes_outputs]
+        asked = [axis for axis in self._axes if axis.has_outputs and axis.accepts_outputs]
         self._await_answers(asked)  # a server handles one request at a time (CiA 301)
         for axis in asked:
             word = canopen_frames.OUTPUTS.pack(axis.outputs | axis.outputs_kept)

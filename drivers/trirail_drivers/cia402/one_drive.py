@@ -201,6 +201,11 @@ async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool)
             break
         except DriveTimeout as error:
             waited = client.clock() - begun
+            if waited >= longest and client.is_stopped:
+                raise DriveError(
+                    f"drive {remote.name}: is in NMT stopped, in which it answers no requests; send it NMT "
+                    "pre-operational, or switch it off and on"
+                ) from error
             if waited >= longest:
                 raise DriveAbsentError(remote.name, awaited, waited) from error
             if remote.logs and not remote.boots:

@@ -69,6 +69,8 @@ class Client:
         """Number of answered requests."""
         self.has_booted = False
         """Whether the drive has sent a boot-up message that no request has reported yet."""
+        self.is_stopped = False
+        """Whether the newest heartbeat received while waiting shows NMT stopped, in which a node answers no request."""
         self._asked: bytes | None = None
         self._last = bytes(8)
         self._again = 0
@@ -186,6 +188,8 @@ class Client:
         if self._is_boot_up(message):
             return self._asked is not None
         data = bytes(message.data)
+        if message.arbitration_id == canopen_frames.HEARTBEAT + self.node and data:
+            self.is_stopped = data[0] & canopen_frames.NMT_STATE_BITS == canopen_frames.STOPPED
         if message.arbitration_id != canopen_frames.SDO_ANSWER + self.node:
             return False
         if self._asked is not None and answers(self._asked, data):
