@@ -740,5 +740,4 @@ def test_a_node_that_missed_its_start_is_configured_again(ready: Rig, refused: b
         ready.drives.reset()
         feedback = ready.cycles(1000)
         assert not any(feedback.unready)
-    assert a.nmt is Nmt.OPERATIONAL
-    assert feedback.fault is None
+    assert (a.nmt, feedback.fault) == (Nmt.OPERATIONAL, None)
