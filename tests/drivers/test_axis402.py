@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Cia402Axis
+from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.row_updates import count_sync, end_reading
 from trirail_drivers.driver.scaling import Scale
@@ -176,6 +177,19 @@ def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -
     assert axis.find_fault(T + 5.299, OFF) is None  # its statuswords have time anew
     axis.on_heartbeat(OPERATIONAL, T + 5.0)
     assert not axis.pdo_silent
+
+
+@pytest.mark.parametrize("state", P)
+@pytest.mark.parametrize("lost", ["silent", "left operational"])
+def test_a_drive_that_must_be_configured_again_shows_whether_it_has_power(state: P, lost: str) -> None:
+    axis = made()
+    axis.state = state
+    if lost == "silent":
+        axis.silent = True
+    else:
+        axis.leave_operational()
+    assert not axis.configured
+    assert (axis.shown_state in HAS_POWER) is (state in HAS_POWER)
 
 
 def test_a_restart_stays_until_the_drive_is_configured_again() -> None:

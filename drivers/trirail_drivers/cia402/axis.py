@@ -339,7 +339,7 @@ class Cia402Axis(Axis):
 
         A drive with power counts as "switched on" until it reports that it follows setpoints.
         """
-        if not self.configured and self.state not in _ENABLED_OR_ENABLING:
+        if not self.configured and self.state in (*_WITHOUT_POWER, PowerState.FAULT):
             return PowerState.NOT_READY_TO_SWITCH_ON
         waits = self.cyclic and (not self.mode.shown or (self.exchange.tells_following and not self.has_followed))
         return PowerState.SWITCHED_ON if waits and self.state is PowerState.OPERATION_ENABLED else self.state
