@@ -168,8 +168,11 @@ class Cia402(Driver[Cia402Axis]):
     def _rejoin_drive(self, number: int, made: SetUp, start: Start) -> None:
         """Let a drive take part in the cycle again after its set-up in the background."""
         axis, drive = self._axes[number], self._drives.each[number]
+        reported = axis.error_code if axis.left_operational else 0
         axis.rejoin(made.exchange, made.units, self._clock(), homed=drive.homing is None)
         self._apply_start(axis, start)
+        # The reason why it left may persist, such as a missing heartbeat; a reset reads the error register.
+        axis.error_code = axis.error_code or reported
         self._prepare_frames()
 
     def _listen(self, axis: Cia402Axis) -> None:
