@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 from drivers.test_cia402 import PERIOD, Rig
-from rigs import OFF, frame
+from rigs import OFF
 from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.driver.driver import MAX_STEPS_LEFT_OUT
 from trirail_drivers.interface import PowerState
@@ -51,20 +51,20 @@ def test_a_quick_stop_is_never_held_back(enabled: Rig) -> None:
     assert sent(enabled) == [layout.RPDO1 + drive.node for drive in enabled.devices]
 
 
-def test_a_reset_before_a_sync_starts_the_nodes_and_clears_the_faults_in_the_next_cycle(enabled: Rig) -> None:
-    node = enabled.devices[1].node
-    enabled.bus.send(frame(layout.NMT, layout.NMT_COMMAND.pack(layout.NMT_PRE_OPERATIONAL, node)))
+def test_a_reset_before_a_sync_clears_the_faults_in_the_next_cycle(enabled: Rig) -> None:
+    failed = enabled.devices[1]
+    failed.fail(0x4310)
     while enabled.cycle().fault is None:
         pass
     enabled.cycles(1200)
     sent(enabled)
-    enabled.drives.next_sync = enabled.clock() + ROOM
+    enabled.drives.next_sync = enabled.clock() + ROOM - 1e-6
     enabled.drives.reset()
     assert sent(enabled) == []
     enabled.cycle()
     after = sent(enabled)
     assert after[0] == layout.SYNC
-    assert layout.NMT in after
+    assert layout.RPDO1 + failed.node in after
     enabled.cycles(300)
     assert enabled.enable().state == (PowerState.OPERATION_ENABLED,) * 3
 
