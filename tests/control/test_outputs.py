@@ -366,6 +366,51 @@ def test_a_stretch_is_closed_where_its_goal_is_stopped(rig: Rig, how: str) -> No
     assert [(row.output, row.value, row.closed) for row in rig.switches][:1] == [("valve", True, False)]
 
 
+@pytest.mark.generated(*range(30))
+def test_each_section_and_pulse_is_closed_before_the_next_begins_wherever_the_goal_ends(seed: int) -> None:
+    """Random sections and pulses of one output, of which those that overlap are refused, and a random stop."""
+    rng = np.random.default_rng(2000 + seed)
+    rig = Rig()
+    rig.enable()
+    marks = []
+    for begin, end in rng.uniform(0.0, 0.06, (int(rng.integers(1, 4)), 2)).tolist():
+        value = bool(rng.random() < 0.7)
+        if rng.random() < 0.7:
+            marks.append(Mark("valve", value=value, start=min(begin, end), end=max(begin, end)))
+        else:
+            marks.append(Mark("valve", value=value, after_start=begin, pulse_width=float(rng.uniform(1e-3, 0.05))))
+    answer = rig.send("g", PoseGoal(0.06, 0.0, 0.0, speed=0.3, marks=tuple(marks)))
+    if isinstance(answer, Refused):
+        assert answer.code is RefusalCode.BAD_MARK
+        del marks[1:]
+        answer = rig.send("g1", PoseGoal(0.06, 0.0, 0.0, speed=0.3, marks=tuple(marks)))
+    assert isinstance(answer, Accepted)
+    rig.cycles(int(rng.integers(1300)))
+    rig.order("stop")
+    rig.until(rig.holds, 20_000)
+    rig.cycles(100)
+    rows = [(row.mark, row.value) for row in rig.switches]
+    assert [row for opened in rows[::2] for row in (opened, (opened[0], not opened[1]))] == rows
+    assert all(value == marks[mark].value for mark, value in rows[::2])
+
+
+@pytest.mark.generated(*range(12))
+def test_accepted_pulses_keep_their_number_after_their_width_is_rounded(seed: int) -> None:
+    """Random widths, at the least increment that is accepted."""
+    rng = np.random.default_rng(3000 + seed)
+    width = float(rng.integers(4) + rng.uniform(0.5, 1.0)) * 1e-3
+    for increment in np.arange(0.2, 2.0, 0.02) * 1e-3:
+        rig = Rig()
+        rig.enable()
+        mark = Mark("valve", start=0.02, end=0.03, increment=float(increment), pulse_width=width)
+        answer = rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, marks=(mark,)))
+        if isinstance(answer, Accepted):
+            break
+    assert isinstance(answer, Accepted)
+    rig.until(rig.holds, 20_000)
+    assert [value for _, value in rig.changes("valve")] == [True, False] * answer.reply.marks[0].number
+
+
 def test_marks_of_blended_goals(rig: Rig) -> None:
     """Each in its own goal; those that a blend cuts off do not switch, unless the next goal is cancelled in time."""
     first = PoseGoal(

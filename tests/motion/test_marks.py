@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from msgspec import structs
 from numpy.typing import NDArray
 from trirail.config import SIM, corrected_geometry, load
 from trirail.errors import RefusalCode, RefusedError
@@ -137,6 +138,26 @@ def test_a_stretch_opens_and_closes() -> None:
     found = placed("3-PRP", run, Mark("valve", start=0.01, end=0.03))
     assert found.switches["on"].tolist() == [1, 0]
     assert placed("3-PRP", run, Mark("valve", value=False, start=0.01)).switches["on"].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    "inner",
+    [
+        Mark("valve", value=False, start=0.02, end=0.025),
+        Mark("valve", value=False, start=0.02, end=0.04),
+        Mark("valve", after_start=0.02),
+        Mark("valve", value=False, after_start=0.02, pulse_width=0.004),
+        Mark("valve", start=0.02, end=0.025, increment=0.002, pulse_width=0.001),
+    ],
+)
+def test_a_section_with_another_switch_of_its_output_is_refused(inner: Mark) -> None:
+    """Otherwise, a stop behind the inner switch would leave the output on."""
+    run = planned("3-PRP", PoseGoal(0.05, 0.0, 0.0))
+    section = Mark("valve", start=0.01, end=0.03)
+    with pytest.raises(RefusedError, match="mark 1 of output 'valve' switches inside the section of mark 0: use"):
+        placed("3-PRP", run, section, inner)
+    other = structs.replace(inner, output="light")
+    assert len(placed("3-PRP", run, section, other).marks) == 2
 
 
 @pytest.mark.parametrize(

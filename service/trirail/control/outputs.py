@@ -20,7 +20,7 @@ from trirail.config import Input, Output
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
-from trirail.motion.marks import GoalMarks
+from trirail.motion.marks import GoalMarks, pulse_cycles
 from trirail.motion.paths import constant_law, law_at
 from trirail.motion.runs import Run
 from trirail.wire.marks import Mark, Switch
@@ -322,7 +322,7 @@ class Outputs:
         switches, opens = goal.pending(output, end)
         rows = np.zeros(len(switches), PLANNED)
         if len(rows):
-            cycles = np.maximum(np.rint(switches["width"] / self._period), 1.0)
+            cycles = pulse_cycles(switches["width"], self._period)
             rows["s"], rows["on"], rows["mark"], rows["opens"] = switches["s"], switches["on"], switches["mark"], opens
             rows["cycles"], rows["goal"] = np.where(np.isnan(cycles), 0.0, cycles), self._number_of(goal.goal)
         return rows

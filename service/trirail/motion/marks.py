@@ -66,7 +66,8 @@ def place_marks(
     Raises
     ------
     RefusedError
-        A mark is not on the path, or two switches would be less than two cycles apart.
+        A mark is not on the path, two switches are too close to each other, or a section contains another switch of
+        its output.
 
     """
     if not marks:
@@ -87,8 +88,16 @@ def place_marks(
         )
     switches = np.array(rows, SWITCH)
     switches = switches[np.argsort(switches["s"], kind="stable")]
-    _check_spacing(switches, marks, period)
+    for output in {mark.output for mark in marks}:
+        own = switches[[marks[number].output == output for number in switches["mark"]]]
+        _check_sections(own, marks)
+        _check_spacing(own, marks, period)
     return Placed(switches, tuple(placed))
+
+
+def pulse_cycles(widths: Array, period: float) -> Array:
+    """Return the durations of pulses in cycles, from their widths [s]; NaN if a switch is not a pulse."""
+    return np.maximum(np.rint(widths / period), 1.0)
 
 
 class GoalMarks:
@@ -290,27 +299,38 @@ def _check_length(number: int, mark: Mark, name: str, length: float, whole: floa
         raise _refusal(number, mark, f"is at {name} = {length * 1e3:g} mm; the path is {whole * 1e3:g} mm long")
 
 
+def _check_sections(switches: NDArray[np.void], marks: Sequence[Mark]) -> None:
+    """Raise RefusedError if an output switches inside a section of another mark.
+
+    An output has one state to which the end of the goal returns it. The section would therefore no longer be closed.
+    """
+    begins = np.array([mark.start is not None and mark.increment is None for mark in marks])[switches["mark"]]
+    begins &= switches["on"] == np.array([mark.value for mark in marks])[switches["mark"]]
+    inside = begins[:-1] & (switches["mark"][1:] != switches["mark"][:-1])
+    if inside.any():
+        section, number = switches["mark"][np.argmax(inside) :][:2].tolist()
+        raise _refusal(number, marks[number], f"switches inside the section of mark {section}: use separate sections")
+
+
 def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: float) -> None:
     """Raise RefusedError if two switches of an output are too close to each other at full speed.
 
     Two switches must not take place in the same cycle at the highest override, and the next switch must wait until a
     pulse has ended. Goals with pulses run at full speed at most.
     """
-    for output in {mark.output for mark in marks}:
-        own = switches[[marks[number].output == output for number in switches["mark"]]]
-        if len(own) < 2:
-            continue
-        spacing = np.diff(own["s"])
-        apart = period if any(mark.pulse_width is not None for mark in marks) else period * HIGHEST_RATE
-        needed = np.where(np.isnan(own["width"][:-1]), apart, own["width"][:-1] + period)
-        k = int(np.argmin(spacing - needed))
-        if spacing[k] < needed[k]:
-            number = int(own["mark"][k + 1])
-            text = (
-                f"switches {spacing[k] * 1e3:.3g} ms after the previous switch; the minimum at full speed is "
-                f"{needed[k] * 1e3:.3g} ms: lower the speed, or move the marks apart"
-            )
-            raise _refusal(number, marks[number], text, float(spacing[k]), float(needed[k]))
+    if len(switches) < 2:
+        return
+    apart = period if any(mark.pulse_width is not None for mark in marks) else period * HIGHEST_RATE
+    cycles = pulse_cycles(switches["width"][:-1], period)
+    spacing, needed = np.diff(switches["s"]), np.where(np.isnan(cycles), apart, (cycles + 1.0) * period)
+    k = int(np.argmin(spacing - needed))
+    if spacing[k] < needed[k]:
+        number = int(switches["mark"][k + 1])
+        text = (
+            f"switches {spacing[k] * 1e3:.3g} ms after the previous switch; the minimum at full speed is "
+            f"{needed[k] * 1e3:.3g} ms: lower the speed, or move the marks apart"
+        )
+        raise _refusal(number, marks[number], text, float(spacing[k]), float(needed[k]))
 
 
 def _refusal(
