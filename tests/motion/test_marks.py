@@ -203,6 +203,16 @@ def test_a_path_on_which_the_tool_only_turns_has_no_share_of_its_length() -> Non
     assert placed("3-PRP", run, Mark("valve", at=Crossing(phi=0.1))).marks[0].pose[2] == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("kind", ROBOTS)
+@pytest.mark.generated(*range(10))
+def test_the_end_of_the_path_is_the_target_although_the_tool_does_not_travel(kind: str, seed: int) -> None:
+    phi = float(np.random.default_rng(seed).uniform(0.002, 0.02))
+    run = planned(kind, PoseGoal(0.0, 0.0, phi))
+    found = placed(kind, run, Mark("valve", start=0.0), Mark("light", before_target=0.0))
+    assert found.switches["s"] == pytest.approx([0.0, run.path.duration, run.path.duration], abs=1e-6)
+    assert found.marks[1].pose[2] == pytest.approx(phi)
+
+
 @pytest.mark.parametrize(
     "given",
     [

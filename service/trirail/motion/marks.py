@@ -252,7 +252,8 @@ def _switches(number: int, mark: Mark, trace: _Trace) -> Iterator[tuple[float, f
     if mark.increment is None:
         begins, ends = trace.times_at(np.array([begin, end], np.float64)).tolist()
         yield begins, np.nan, number, int(mark.value)
-        yield ends, np.nan, number, int(not mark.value)
+        # The platform may turn after the tool has travelled the whole length.
+        yield ends if mark.end is not None else trace.duration, np.nan, number, int(not mark.value)
         return
     count = int((end - mark.start) / mark.increment * (1.0 + 1e-12)) + 1
     if count > MAX_SWITCHES:
@@ -281,6 +282,8 @@ def _time_of(number: int, mark: Mark, trace: _Trace) -> float:
             if time > trace.duration:
                 raise _refusal(number, mark, f"is at {name} = {time:g} s; the path takes {trace.duration:g} s")
             return time if name == "after_start_s" else trace.duration - time
+    if mark.before_target == 0.0:
+        return trace.duration  # even if the tool does not travel at the end of the path
     for name, length in (("after_start", mark.after_start), ("before_target", mark.before_target)):
         if length is not None:
             _check_length(number, mark, name, length, trace.length)

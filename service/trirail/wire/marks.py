@@ -95,7 +95,7 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
 
     @property
     def closes(self) -> bool:
-        """True if the output gets the opposite value at the end of the pulse or section, or earlier if a stop ends it."""
+        """True if the output gets the opposite value at the end of the pulse or section, or where a stop ends it."""
         return self.pulse_width is not None or self.start is not None
 
 
