@@ -430,6 +430,24 @@ def test_marks_of_blended_goals(rig: Rig) -> None:
     assert not rig.changes("late")
 
 
+@pytest.mark.generated(*range(20))
+def test_marks_at_the_end_of_a_path_switch_if_the_next_goal_follows_with_blend_zero(seed: int) -> None:
+    rng = np.random.default_rng(4000 + seed)
+    rig = Rig()
+    rig.enable()
+    names = "g0", "g1", "g2"
+    for name in names:
+        x, y, phi = rng.uniform(-1.0, 1.0, 3) * REACH["3-PRP"]
+        marks = (
+            Mark("valve", before_target=0.0, value=name != "g1"),
+            Mark("light", before_target_s=0.0, value=name == "g1"),
+            Mark("late", at_path_fraction=1.0, value=name != "g1"),
+        )
+        assert isinstance(rig.send(name, PoseGoal(x, y, phi, blend=0.0, marks=marks)), Accepted)
+    rig.until(rig.holds, 60_000)
+    assert sorted((row.goal, row.mark) for row in rig.switches) == [(name, k) for name in names for k in range(3)]
+
+
 def test_marks_that_a_cancelled_blend_had_cut_off_switch_again(rig: Rig) -> None:
     first = PoseGoal(
         0.05,

@@ -233,6 +233,8 @@ class GoalPlanner:
         cycles in the future.
         """
         end = run.path.duration
+        if blend == 0.0:
+            return end  # a search would end a little earlier, and cut off marks at the end
         target = nominal_motion(run.path, end).pose
         # Assume a rate of at least 1, even at override 0, because the override may rise at any time.
         soonest = run.law_state.s + lead * self._period * max(run.law_state.rate, run.target, 1.0)
