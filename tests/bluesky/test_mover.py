@@ -298,7 +298,7 @@ def test_a_flight_that_is_stopped_while_its_path_is_sent_does_not_fly() -> None:
         begun = flight.kickoff()
         await until(lambda: len(robot.targets) == 1)
         stopping = asyncio.create_task(flight.stop(success=False))
-        await until(lambda: flight._stopped)
+        await until(lambda: flight._stopped is not None)
         robot.accepts.set()
         await stopping
         assert robot.under_way == []

@@ -412,6 +412,60 @@ def test_an_error_in_a_plan_stops_its_flight(stage: Stage, robot: Robot, engine:
     assert outcome_of(robot, begin) == "stopped"
 
 
+@pytest.mark.parametrize("early", [True, False])
+def test_a_further_collect_yields_no_row_again(stage: Stage, engine: Any, early: bool) -> None:
+    flight = stage.fly_to(0.02, 0.0, 0.0, speed=0.5)
+
+    def plan() -> Any:
+        yield from bps.open_run()
+        yield from bps.kickoff(flight, wait=True)
+        if early:
+            yield from bps.sleep(0.1)
+            yield from bps.collect(flight)
+        yield from bps.complete(flight, wait=True)
+        yield from bps.collect(flight)
+        yield from bps.collect(flight)
+        yield from bps.close_run()
+
+    found = pages(run(engine, plan()))
+    assert np.all(np.diff(found["stage-t"]) > 0.0)
+    assert found["stage-x"][-1] == pytest.approx(0.02, abs=HALF_WINDOW)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_a_pause_on_the_way_to_a_flight_is_no_failure(stage: Stage, robot: Robot, engine: Any, share: float) -> None:
+    points = [(0.0, 0.02, 0.0, 0.0), (0.5, 0.03, 0.0, 0.0)]
+    robot.override(20.0)
+    begin = newest_event(robot)
+    with when(lambda: robot.state().pose.x > share * 0.02, engine.request_pause), pytest.raises(RunEngineInterrupted):
+        run(engine, bp.fly([stage.follow(points)]))
+    assert robot.state().commanded.pose.x < 0.02
+    robot.override(100.0)
+    engine.resume()
+    assert [event.outcome for event in goal_events(robot, begin)] == ["stopped", "done", "done"]
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_a_flight_that_is_stopped_before_its_start_fails_only_if_that_is_a_failure(
+    stage: Stage, robot: Robot, engine: Any, success: bool
+) -> None:
+    flight = stage.fly_to(0.05, 0.0, 0.0)
+
+    async def fly() -> None:
+        status = flight.kickoff()
+        await flight.stop(success)
+        await status
+        await flight.complete()
+
+    begin, ended = newest_event(robot), asyncio.run_coroutine_threadsafe(fly(), engine.loop)
+    if success:
+        ended.result(WITHIN)
+    else:
+        with pytest.raises(TrirailError, match="stopped before"):
+            ended.result(WITHIN)
+    assert goal_events(robot, begin) == []
+
+
 def test_a_pause_stops_a_flight_and_resume_repeats_it(stage: Stage, robot: Robot, engine: Any) -> None:
     points = [(0.0, 0.01, 0.0, 0.0), (0.5, 0.02, 0.01, 0.05), (1.0, 0.03, 0.0, 0.0)]
     robot.override(20.0)

@@ -59,10 +59,13 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         self._sampling: asyncio.Task[None] | None = None
         self._samples: list[tuple[str, dict[str, Reading[Any]]]] = []
         """Readings, each with the id of the goal in progress, since states can arrive before the path is accepted."""
+        self._collected = 0
+        """Number of rows that `collect` has yielded."""
         self._sending = asyncio.Lock()
         self._interrupted: AsyncGoalHandle | None = None
         """Goal that was stopped on request, which is not a failure."""
-        self._stopped = False
+        self._stopped: bool | None = None
+        """Whether the start was stopped without being a failure; None if it was not stopped."""
         self._stopping: asyncio.Task[None] | None = None
         super().__init__(name)
 
@@ -79,6 +82,9 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
 
         The calling task runs the plan. If this task ends before the path does, the path is stopped.
         """
+        self._end_sampling()  # that of a path for which the plan has not called `complete`
+        self._goal, self._samples, self._collected, self._stopped = None, [], 0, None
+        self._sending = asyncio.Lock()  # a lock of this event loop
         status = AsyncStatus(self._kickoff())
         if (plan := asyncio.current_task()) is not None:
             plan.add_done_callback(lambda _: self._end_with_plan(status))
@@ -86,14 +92,12 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
 
     async def _kickoff(self) -> None:
         link = await self._stage.link()
-        self._end_sampling()  # that of a path for which the plan has not called `complete`
-        self._goal, self._samples = None, []
-        self._stopped = False
-        self._sending = asyncio.Lock()  # a lock of this event loop
         if self._first is not None:
             await link.mover.start(self._first).end
         async with self._sending:
-            if self._stopped:  # stop() may have run during the await, which mypy cannot know
+            if self._stopped:
+                return
+            if self._stopped is not None:
                 raise TrirailError("the motion was stopped before its goal was sent")
             if not self._has_marks:
                 self._sampling = asyncio.create_task(self._sample(link.robot))
@@ -111,6 +115,8 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         Raises UnfinishedError with the reason if the path ends with an outcome other than done.
         """
         goal = self._goal
+        if goal is None and self._stopped:
+            return
         if goal is None:
             raise TrirailError(f"{self.name}: complete was called before kickoff")
         link = await self._stage.link()
@@ -127,8 +133,11 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
                 self._samples.append(end)
 
     async def stop(self, success: bool = True) -> None:
-        """Stop the path; return when the robot is at rest."""
-        self._stopped = True
+        """Stop the path; return when the robot is at rest.
+
+        With `success`, `kickoff` and `complete` end without an error, also if the path has not begun.
+        """
+        self._stopped = success
         await (await self._stage.link()).mover.stop(success)
         async with self._sending:  # wait until the service has accepted a goal that is being sent
             goal = self._goal
@@ -152,11 +161,15 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         return {self.name: {f"{self.name}-{name}": _key(source, *column) for name, column in COLUMNS.items()}}
 
     async def collect(self) -> AsyncIterator[PartialEvent]:
-        """Yield a row for each switch of an output on the path; if there are no marks, yield a row for each state."""
+        """Yield a row for each switch of an output on the path; if there are no marks, yield a row for each state.
+
+        A further call yields only the rows that have been added since then.
+        """
         goal_id = self._goal.id if self._goal is not None else ""
         sampled = [readings for during, readings in self._samples if during == goal_id]
         rows = self._switches() if self._has_marks else sampled
-        for row in rows:
+        for row in rows[self._collected :]:
+            self._collected += 1
             values = {name: reading["value"] for name, reading in row.items()}
             stamps = {name: reading["timestamp"] for name, reading in row.items()}
             yield {"time": next(iter(stamps.values())), "data": values, "timestamps": stamps}
