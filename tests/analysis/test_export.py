@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from msgspec import structs
 from pyarrow import csv, parquet
 from trirail.analysis import export, mcap
+from trirail.cli import recording_commands
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
 from trirail.telemetry import recording as recordings
@@ -72,6 +73,56 @@ def test_every_switch_comes_back(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"switches{suffix}"
     assert export.write_switches(read(tmp_path / "made.rrd"), path) == len(happened)
     assert read_table(path).to_pylist() == switch_rows(tuple(happened))
+
+
+def switched(goal: str, cycle: int) -> Switch:
+    return Switch(goal, 0, "valve", True, cycle, 1e-3 * cycle, 1.8e9, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(["g1", "g2"]), st.integers(0, 900), st.integers(0, 100)), max_size=10),
+    st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
+)
+def test_switches_are_selected_by_their_own_goal_and_time(
+    recording: Recording, happened: list[tuple[str, int, int]], span: tuple[float, float]
+) -> None:
+    """Not by the time of the event that reports them, which may be that of another goal."""
+    rows, lines = list[Switch](), list[Line]()
+    for seq, (goal, cycle, late) in enumerate(sorted(happened, key=lambda each: each[1]), 1):
+        rows.append(switched(goal, cycle))
+        t = 1e-3 * (cycle + late)
+        event = Event("output", "info", "switched", goal=goal, marks=(rows[-1],), seq=seq, t=t, cycle=0, time=0.0)
+        lines.append(Line(t, recording.wall[0], "INFO", "", event))
+    told = recording._replace(events=lines)
+    assert export.switches(told) == tuple(rows)
+    assert export.switches(told, goal="g2") == tuple(row for row in rows if row.goal == "g2")
+    begin, end = span
+    assert export.switches(told, begin, end) == tuple(row for row in rows if begin <= row.t <= end)
+
+
+def test_the_command_writes_all_switches_of_a_goal_and_no_others(tmp_path: Path) -> None:
+    recorder = Recorder(load(SIM), tmp_path, path=tmp_path / "made.rrd", live=False)
+    recorder.records(made.records(1.0).tobytes())
+    happened = {"g1": (100, 400, 600), "g2": (500, 700)}  # a pulse of g1 ends after g1 does
+    switches: list[Switch] = []
+    for number, (goal, cycles) in enumerate(happened.items()):
+        given_goal = GoalRequest(number, "ann", goal, MoveGoal(0.0, 0.0, 0.1), 0)
+        recorder.control_input(ControlInput(number + 1, 50 + 400 * number, 0, given_goal))
+        switches += [switched(goal, cycle) for cycle in cycles]
+    for seq, switch in enumerate(sorted(switches, key=lambda switch: switch.cycle)):
+        notice = Notice("output", "info", "switched", goal=switch.goal, marks=(switch,))
+        recorder.event(Event(**structs.asdict(notice), seq=seq, t=switch.t + 0.09, cycle=switch.cycle + 90, time=0.0))
+    for goal, t in (("g1", 0.45), ("g2", 0.9)):
+        recorder.event(
+            Event("goal", "info", "done", id=goal, outcome="done", seq=9, t=t, cycle=round(1e3 * t), time=0.0)
+        )
+    recorder.close()
+    for goal, cycles in happened.items():
+        out = tmp_path / f"{goal}.parquet"
+        assert recording_commands.export(tmp_path / "made.rrd", out=out, goal=goal, switches=True) == 0
+        assert [(row["goal"], row["cycle"]) for row in read_table(out).to_pylist()] == [
+            (goal, cycle) for cycle in cycles
+        ]
 
 
 @pytest.mark.parametrize("suffix", export.FORMATS)

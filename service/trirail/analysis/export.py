@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -52,19 +53,35 @@ def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
     return _write(path, lambda: table(recording, columns))
 
 
-def write_switches(recording: Recording, path: Path) -> int:
+def write_switches(
+    recording: Recording, path: Path, begin: float | None = None, end: float | None = None, goal: str | None = None
+) -> int:
     """Write a table of the outputs that were switched on the paths of goals; return the number of rows.
 
-    The table has one row per switched output. `path` and the errors are the same as for `write`. The columns are the
-    fields of trirail.wire.marks.Switch; a field with several numbers has one column per number.
+    The table has one row per switched output. `path` and the errors are the same as for `write`, and the other
+    parameters are those of `switches`. The columns are the fields of trirail.wire.marks.Switch; a field with several
+    numbers has one column per number.
     """
-    return _write(path, lambda: pa.Table.from_pylist(switch_rows(switches(recording)), SWITCHES))
+    return _write(path, lambda: pa.Table.from_pylist(switch_rows(switches(recording, begin, end, goal)), SWITCHES))
 
 
-def switches(recording: Recording) -> tuple[Switch, ...]:
-    """Return the switches of outputs on the paths of goals, in the order of their cycles."""
+def switches(
+    recording: Recording, begin: float | None = None, end: float | None = None, goal: str | None = None
+) -> tuple[Switch, ...]:
+    """Return the switches of outputs on the paths of goals, in the order of their cycles.
+
+    An event reports a switch up to 0.1 s later, and a pulse may end after its goal. A part of a recording may therefore
+    lack switches: give the whole recording, and select by the times `begin` and `end` of the switches [s] or by a goal.
+    """
+    first, last = -math.inf if begin is None else begin, math.inf if end is None else end
     events = (line.event for line in recording.events if line.event is not None)
-    return tuple(sorted((switch for event in events for switch in event.marks), key=lambda switch: switch.cycle))
+    chosen = (
+        switch
+        for event in events
+        for switch in event.marks
+        if first <= switch.t <= last and goal in (None, switch.goal)
+    )
+    return tuple(sorted(chosen, key=lambda switch: switch.cycle))
 
 
 def _write(path: Path, make: Callable[[], pa.Table]) -> int:

@@ -131,7 +131,8 @@ def export(
     goal
         Write only the time from when the goal with this id was given until it ended.
     switches
-        Write instead one row per switch of an output on a path, with the cycle and both poses.
+        Write instead one row per switch of an output on a path, with the cycle and both poses. A goal has all of its
+        switches, even those after its end.
     format
         Format of the file. If absent, the suffix of --out selects it.
     """
@@ -143,11 +144,18 @@ def export(
         raise TrirailError("--columns is only for tables: MCAP messages contain all columns")
     if switches and (every is not None or wanted or path.suffix == ".mcap"):
         raise ServiceError("--switches writes a table with one row per switch: omit --every, --columns and MCAP")
-    recording = _read(file).part(begin, end, goal=goal, every=every)
+    recording = _read(file)
+    part = recording.part(begin, end, goal=goal, every=every)
     if path.suffix == ".mcap":
-        unit, count = "messages", _write_mcap(recording, path)
+        unit, count = "messages", _write_mcap(part, path)
+    elif switches:
+        from trirail.analysis.export import write_switches
+
+        unit, count = "rows", write_switches(recording, path, begin, end, goal)
     else:
-        unit, count = "rows", _write_table(recording, path, wanted, switches=switches)
+        from trirail.analysis.export import write
+
+        unit, count = "rows", write(part, path, wanted)
     if json:
         terminal.json({"file": str(path), unit: count})
     else:
@@ -192,12 +200,6 @@ def _write_mcap(recording: Recording, path: Path) -> int:
             raise
         raise TrirailError("MCAP needs rosbags: pip install 'trirail[mcap]'") from error
     return mcap.write(recording, path)
-
-
-def _write_table(recording: Recording, path: Path, columns: list[str], *, switches: bool) -> int:
-    from trirail.analysis.export import write, write_switches
-
-    return write_switches(recording, path) if switches else write(recording, path, columns)
 
 
 def _read(files: tuple[Path, ...]) -> Recording:

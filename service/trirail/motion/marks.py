@@ -89,9 +89,9 @@ def place_marks(
     switches = np.array(rows, SWITCH)
     switches = switches[np.argsort(switches["s"], kind="stable")]
     for output in {mark.output for mark in marks}:
-        own = switches[[marks[number].output == output for number in switches["mark"]]]
-        _check_sections(own, marks)
-        _check_spacing(own, marks, period)
+        of_output = switches[[marks[number].output == output for number in switches["mark"]]]
+        _check_sections(of_output, marks)
+        _check_spacing(of_output, marks, period)
     return Placed(switches, tuple(placed))
 
 
