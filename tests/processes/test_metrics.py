@@ -14,6 +14,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -46,8 +47,9 @@ from trirail.processes.monitoring import (
 )
 from trirail.processes.publications import StateMaker
 from trirail.processes.zenoh_links import ResourceUse
-from trirail.wire.messages import Event, FaultDetail
+from trirail.wire.messages import Event, FaultDetail, Outcome
 from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import FaultCause
 from waiting import wait_until
 
 TURN = 0.1
@@ -91,6 +93,18 @@ def test_a_bucket_has_the_values_up_to_its_bound(values: list[float]) -> None:
         assert sum(histogram.counts[: place + 1]) == sum(value <= bound for value in values)
     assert sum(histogram.counts) == len(values)
     assert histogram.total == pytest.approx(sum(values))
+
+
+def test_goals_and_faults_are_counted_from_zero() -> None:
+    """Prometheus' increase() does not see the first event of a series that begins at 1."""
+    told = Told()
+    told.rows()
+    text = exposed(told.newest(), RecorderMeasurements(0, 0, 0), [])
+    goals = re.findall(r'trirail_goals_total{outcome="(.*)"} 0.0', text)
+    assert set(goals) == set(get_args(Outcome))
+    faults = re.findall(r'trirail_faults_total{cause="(.*)",code="",drive="(.*)"} 0.0', text)
+    assert set(faults) >= {("quick_stop", ""), ("loop", ""), ("following_error", "A"), ("following_error", "C")}
+    assert len(set(faults)) == len(faults) >= len(FaultCause)
 
 
 def test_what_the_service_does_is_counted() -> None:

@@ -36,12 +36,20 @@ from trirail.processes.zenoh_links import ResourceUse
 from trirail.telemetry.provenance import software
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials, with_role
-from trirail.wire.vocabulary import MODES
+from trirail.wire.messages import FaultDetail
+from trirail.wire.vocabulary import MODES, FaultCause
 
 PREFIX: Final = "trirail"
 Values = Mapping[Any, float]
 """Values of a metric, by the value of its label, or by a tuple of label values if the metric has several labels."""
 NONE_YET: Final[Values] = {}
+_NO_FAULTS: Final = {
+    FaultDetail(cause.value, drive): 0
+    for cause in FaultCause
+    for drive in (NAMES if cause is FaultCause.FOLLOWING_ERROR else ("",))
+}
+"""Counts of the faults that the service detects, before the first. Without a sample of 0, Prometheus' increase() does
+not see the first fault. The drives' own faults have too many codes."""
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 TICKS: Final = os.sysconf("SC_CLK_TCK")
 
@@ -105,7 +113,7 @@ def _goals(events: EventCounts) -> Iterator[Metric]:
         "goal_settle_seconds", "Time from the end of a goal's path until the robot was in position.", events.settle
     )
     faults = _counter("faults", "Faults, by cause, drive and the drive's own code.", ["cause", "drive", "code"])
-    for fault, times in events.faults.copy().items():
+    for fault, times in (_NO_FAULTS | events.faults).items():
         faults.add_metric([fault.cause, fault.drive, f"0x{fault.code:04X}" if fault.code else ""], times)
     yield faults
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
 from msgspec import Struct
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 from trirail.processes.zenoh_links import ResourceUse
 from trirail.wire.decoding import converted, prepare
-from trirail.wire.messages import Event, FaultDetail
+from trirail.wire.messages import Event, FaultDetail, Outcome
 from trirail.wire.state import FrameCounts, State
 
 MEASUREMENT_PERIOD_S: Final = 1.0
@@ -62,7 +62,7 @@ class EventCounts:
     """Numbers of goals and faults in the events of the service, which the supervisor receives once each."""
 
     def __init__(self) -> None:
-        self.goals: dict[str, int] = {}
+        self.goals: dict[str, int] = dict.fromkeys(get_args(Outcome), 0)
         """Number of goals that have ended, by outcome."""
         self.faults: dict[FaultDetail, int] = {}
         self.settle = Histogram.empty(SETTLE_BOUNDS)
