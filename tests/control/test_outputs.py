@@ -19,7 +19,7 @@ from trirail.wire.goal_kind import OwnLimits
 from trirail.wire.goals import MoveGoal, PoseGoal
 from trirail.wire.marks import Mark, StopAt, Switch
 from trirail.wire.messages import GoalReply
-from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, Refused, Request
+from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, GoalRequest, Refused, Request
 from trirail.wire.vocabulary import Command, Mode, SetOutput
 
 OUTPUTS = {
@@ -364,6 +364,33 @@ def test_a_stretch_is_closed_where_its_goal_is_stopped(rig: Rig, how: str) -> No
     assert not rig.value("valve")
     assert not rig.changes("late")  # not reached
     assert [(row.output, row.value, row.closed) for row in rig.switches][:1] == [("valve", True, False)]
+
+
+@pytest.mark.parametrize("how", ["stop", "preempted", "edge", "disable"])
+def test_a_closed_row_has_the_deadline_of_its_cycle_and_the_poses_of_the_cycle_before(rig: Rig, how: str) -> None:
+    def cycles(number: int) -> None:
+        for _ in range(number):
+            rig.cycle()
+            record = rig.control.measured.record
+            record["cycle"], record["deadline_ns"] = rig.control.cycles, 5_000_000_000 + 1_000_000 * rig.control.cycles
+
+    edge = StopAt("part") if how == "edge" else None
+    rig.send("g", PoseGoal(0.05, 0.0, 0.0, marks=(Mark("valve", start=0.01),), stop_at=edge))
+    rig.until(lambda: rig.poses[-1][0] > 0.02)
+    cycles(2)
+    match how:
+        case "preempted":
+            rig.more.append(GoalRequest(99, "ann", "g2", PoseGoal(0.0, 0.03, 0.0), 0))
+        case "edge":
+            rig.drives.inputs = (0, 1 << 16, 0)
+        case _:
+            rig.more.append(CommandRequest(99, "ann", Command(how)))
+    cycles(10)
+    rig.until(lambda: any(row.closed for row in rig.switches))
+    (row,) = (row for row in rig.switches if row.closed)
+    assert row.time == pytest.approx(5.0 + 1e-3 * row.cycle, abs=1e-9)
+    assert (row.cycle, False) in rig.changes("valve")
+    assert row.commanded == tuple(rig.poses[row.cycle - 2])
 
 
 @pytest.mark.generated(*range(30))

@@ -373,20 +373,23 @@ class Outputs:
     def close(self, goal: str, outcome: Outcome, cycle: int, record: NDArray[np.void]) -> None:
         """Switch back the outputs that are still switched by an ended goal.
 
-        If the goal is done, its pulses still run to their end.
+        If the goal is done, its pulses still run to their end. The rows of the log are reported before `cycle` runs.
+        They therefore have the poses of the latest cycle, and the deadline of `cycle` is computed.
         """
         if goal not in self._goals:
             return
-        number = self._goals[goal]
+        number, latest = self._goals[goal], record[0]
         self._over.add(goal)
+        later_ns = (cycle - int(latest["cycle"])) * round(self._period * 1e9)
+        deadline_ns = int(latest["deadline_ns"]) + later_ns if latest["deadline_ns"] else 0
         for k, row in enumerate(self.state):
             if row["goal"] != number or (outcome == "done" and row["until"]):
                 continue
             value = not row["opened"]
             self._write(k, value)
             if self.logged < len(self.log):
-                pose, measured = record[0]["commanded_pose"], record[0]["pose"]
-                self.log[self.logged] = cycle, k, value, number, row["mark"], 1, 0, pose, measured
+                poses = latest["commanded_pose"], latest["pose"]
+                self.log[self.logged] = cycle, k, value, number, row["mark"], 1, deadline_ns, *poses
                 self.logged += 1
             row["goal"] = row["until"] = 0
 

@@ -186,7 +186,8 @@ class Switch(Struct, frozen=True, omit_defaults=True):
     measured: Triple
     """Measured pose in this cycle: x, y [m], phi [rad]."""
     closed: bool = False
-    """True if the output switched back because the goal ended or stopped, False if it switched at a mark."""
+    """True if the output switched back because the goal ended or stopped, False if it switched at a mark. If True, the
+    poses are those of the cycle before, because the switch is reported before its cycle runs."""
 
 
 def switch_rows(switches: tuple[Switch, ...]) -> list[dict[str, Any]]:
