@@ -129,8 +129,22 @@ def test_a_goal_with_own_limits_preempts_a_motion_above_full_speed_within_them(w
     assert np.abs(np.diff(accelerations, axis=0)).max() / session.config.period <= OWN_JERK * 1.01
 
 
+BRAKING_EXCESS = 3.0
+"""How far a pause, or a lower override, may exceed the own limits of a goal, whose path may use them completely."""
+
+
+def own_shares(session: Session, own: OwnLimits, begun: int = 0) -> tuple[float, float, float]:
+    """Greatest velocity, acceleration and jerk since a record, divided by the limits of the goal."""
+    records = session.records[begun:]
+    accelerations = records["commanded_pose_acceleration"]
+    jerks = np.diff(accelerations, axis=0) / session.config.period
+    rates = (records["commanded_pose_velocity"], own.velocity), (accelerations, own.acceleration), (jerks, own.jerk)
+    velocity, acceleration, jerk = (float(np.abs(rate / limit).max()) for rate, limit in rates if limit is not None)
+    return velocity, acceleration, jerk
+
+
 @pytest.mark.generated(*range(12))
-def test_a_goal_keeps_its_own_limits_while_it_is_paused_and_resumed_and_its_override_changes(seed: int) -> None:
+def test_a_goal_keeps_its_own_limits_while_its_rate_changes(seed: int) -> None:
     rng = np.random.default_rng(seed)
     session = Session()
     session.post("g", PoseGoal(0.1, 0.02, rng.uniform(-0.1, 0.1), limits=OWN))
@@ -140,10 +154,33 @@ def test_a_goal_keeps_its_own_limits_while_it_is_paused_and_resumed_and_its_over
             break
         command = Command.RESUME if session.control.state.paused else rng.choice([Command.PAUSE, Command.OVERRIDE])
         session.order(Command(command), rng.uniform(0.0, 2.0) if command == Command.OVERRIDE else None)
-    accelerations = session.records["commanded_pose_acceleration"]
-    assert np.abs(session.records["commanded_pose_velocity"] / OWN.velocity).max() <= 1.001
-    assert np.abs(accelerations / OWN.acceleration).max() <= 1.001
-    assert np.abs(np.diff(accelerations, axis=0) / OWN.jerk).max() / session.config.period <= 1.01
+    velocity, acceleration, jerk = own_shares(session, OWN)
+    assert velocity <= 1.001
+    assert acceleration <= 1.001 * BRAKING_EXCESS
+    assert jerk <= 1.01 * BRAKING_EXCESS
+
+
+@pytest.mark.generated(*range(12))
+def test_a_goal_with_own_limits_pauses_soon_wherever_it_is_and_keeps_them_when_it_is_resumed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    acceleration, jerk = 10.0 ** rng.uniform(-1.0, 0.0), 10.0 ** rng.uniform(0.5, 1.5)
+    own = OwnLimits(velocity=(0.2, 0.2, 1.0), acceleration=(acceleration,) * 2 + (5.0,), jerk=(jerk,) * 2 + (50.0,))
+    session = Session()
+    session.post("g", PoseGoal(0.1, 0.0, 0.0, limits=own))
+    session.until(lambda: bool(session.control.schedule.runs))
+    share = rng.uniform(0.02, 0.85)
+    session.until(lambda: session.control.schedule.runs[0].progress >= share, 20_000)
+    begun = len(session.records)
+    speed = session.records["commanded_pose_velocity"][-1, 0]
+    session.order(Command.PAUSE)
+    soon = 3.0 * (speed / acceleration + acceleration / jerk) + 0.3
+    assert session.until(session.holds, 20_000) * session.config.period <= soon
+    assert session.records["commanded_pose_velocity"][begun:, 0].max() <= speed + acceleration**2 / jerk + 0.1 * acceleration
+    if session.control.state.paused:
+        session.order(Command.RESUME)
+        resumed = len(session.records)
+        session.until(lambda: "g" in session.ended, 20_000)
+        assert max(own_shares(session, own, resumed)) <= 1.01
 
 
 @pytest.mark.parametrize("before", ["moving", "paused"])

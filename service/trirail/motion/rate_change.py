@@ -23,6 +23,15 @@ MIN_SAMPLES_PER_CYCLE = 40
 SAMPLES_PER_SECOND = 120_000.0
 """Number of samples in and next to pieces of a path that are taken in one cycle, per second of the cycle's period. A
 longer cycle has more time."""
+OWN_EXCESSES = (1.0, 3.0, math.inf)
+"""Factors by which a change to a lower rate may exceed a goal's own limits, tried in turn. The last one is for a faster
+motion that passes into the goal. The robot's limits always apply."""
+PROMPTNESS = 3.0
+"""Greatest duration of a change to a lower rate within a goal's own limits, in durations of a stop within them."""
+MIN_STOP_S = 0.1
+"""Duration that such a change may always have [s]."""
+MAX_JERK = 1e9
+"""Jerk that stands for no limit [m/s³, rad/s³]."""
 MAX_POSTPONEMENTS = 3
 """Greatest number of times that the start of a law is postponed, to leave enough cycles for sampling the whole law."""
 
@@ -54,7 +63,8 @@ class RateChange:
     quicker change continues, because a slower motion leaves a larger part of the limits free. A motion that has not
     begun yet begins at the new rate.
 
-    The goals' own limits also apply, unless the change is a stop, or a faster motion passes into a goal with limits.
+    The goals' own limits also apply, unless the change is a stop. A path that uses them completely leaves nothing for a
+    change, so a change to a lower rate may exceed them if it would otherwise take too long; see OWN_EXCESSES.
     """
 
     def __init__(
@@ -116,7 +126,7 @@ class RateChange:
         self._motion_key = schedule.version, len(schedule.runs)
         self._possible = self.rate
         self._share = 0
-        self._keeps_own = not self._stops
+        self._excess = OWN_EXCESSES[-1 if self._stops else 0]
         self._candidate: _Candidate | None = None
         self._unsampled: list[_Part] | None = None
         self._first_s = 0.0
@@ -154,7 +164,8 @@ class RateChange:
         if candidate.ahead:
             path, first, until, own = candidate.ahead.pop()
             pose = self._schedule.commanded.pose
-            result = self._scaling.sample(path, candidate.law, first, until, pose, own if self._keeps_own else None)
+            allowed = own * self._excess if own is not None else None
+            result = self._scaling.sample(path, candidate.law, first, until, pose, allowed)
             if not result.within_limits:
                 self._next_share()
                 return
@@ -185,17 +196,21 @@ class RateChange:
 
     def _next_share(self) -> None:
         self._candidate, self._share = None, (self._share + 1) % len(CHANGE_SHARES)
-        if self._share == 0 and not self.applied:
-            self._keeps_own = self._keeps_own and self._is_within_own()
+        if self._share == 0 and self.lowers_rate:
+            self._excess = OWN_EXCESSES[min(OWN_EXCESSES.index(self._excess) + 1, len(OWN_EXCESSES) - 1)]
 
-    def _is_within_own(self) -> bool:
-        """Return whether the present motion keeps the own limits of its goal; False if it has none.
+    def _is_prompt(self, law: Path) -> bool:
+        """Return whether a change to a lower rate takes at most PROMPTNESS times as long as a stop within own limits.
 
-        A faster motion exceeds them when it passes into the goal, and no change of the rate could then keep them.
+        The stop is one from the present velocity, within the acceleration and jerk of the current goal.
         """
-        run, pose = self._schedule.runs[-1], self._schedule.commanded.pose
-        own = run.own.limits
-        return own is not None and self._scaling.sample(run.path, run.law, run.time, run.time, pose, own).within_limits
+        own = self._schedule.runs[-1].own.limits
+        if own is None or not self.lowers_rate or self._excess == math.inf:
+            return True
+        acceleration, jerk = own[:, 1], np.minimum(own[:, 2], MAX_JERK)
+        stop = np.abs(self._schedule.commanded.velocity) / acceleration
+        stop += np.where(np.isfinite(acceleration), acceleration, 0.0) / jerk
+        return float(law.knots[-2]) <= PROMPTNESS * float(stop.max()) + MIN_STOP_S
 
     def _propose(self, run: Run) -> _Candidate | None:
         """Return a law at the current fraction of the quickest change; None if there is no suitable law.
@@ -207,6 +222,8 @@ class RateChange:
             at = run.law_state if cycles == 1 else run.law_state_at(run.time + (cycles - 1) * self._period)
             law = self._scaling.ramp(at, self._possible, CHANGE_SHARES[self._share])
             if law is None or (self.applied and not self._ends_sooner(run, law, cycles)):
+                return None
+            if not self._is_prompt(law):
                 return None
             ahead = self._parts(run, law, self._possible, float(law.knots[-2]) + self._period)
             if len(ahead) <= cycles:

@@ -75,7 +75,7 @@ Speed = Annotated[
 ]
 GoalLimits = Annotated[
     OwnLimits | None,
-    Meta(description="own velocity, acceleration, jerk (except in stops)"),
+    Meta(description="own velocity, acceleration, jerk (not while braking)"),
 ]
 Blend = Annotated[
     Annotated[float, Meta(ge=0.0, le=1e3)] | None,
