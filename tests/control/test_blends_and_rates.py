@@ -175,7 +175,10 @@ def test_a_goal_with_own_limits_pauses_soon_wherever_it_is_and_keeps_them_when_i
     session.order(Command.PAUSE)
     soon = 3.0 * (speed / acceleration + acceleration / jerk) + 0.3
     assert session.until(session.holds, 20_000) * session.config.period <= soon
-    assert session.records["commanded_pose_velocity"][begun:, 0].max() <= speed + acceleration**2 / jerk + 0.1 * acceleration
+    assert (
+        session.records["commanded_pose_velocity"][begun:, 0].max()
+        <= speed + acceleration**2 / jerk + 0.1 * acceleration
+    )
     if session.control.state.paused:
         session.order(Command.RESUME)
         resumed = len(session.records)

@@ -574,6 +574,41 @@ class TestFaults:
         assert states[0] is P.QUICK_STOP_ACTIVE
         assert drive.state is P.SWITCH_ON_DISABLED
 
+    def test_closing_waits_only_until_a_drive_that_left_operational_shows_no_power(self, enabled: Rig) -> None:
+        drive = enabled.devices[1]
+        drive._enter(Nmt.PRE_OPERATIONAL)  # 6007h: it switches its power off by itself
+        drive._send(0x700 + drive.node, bytes([Nmt.PRE_OPERATIONAL]))
+        enabled.cycle()
+        begun = enabled.clock()
+        enabled.drives.close()
+        assert enabled.clock() - begun < 0.2
+
+    @pytest.mark.parametrize("told", [True, False], ids=["boot-up told", "boot-up lost"])
+    @pytest.mark.parametrize("another", [True, False])
+    def test_a_drive_that_falls_silent_after_it_has_left_operational_returns(
+        self, enabled: Rig, told: bool, another: bool
+    ) -> None:
+        """Its statusword has not been read, so that it counted as powered. Meanwhile, another drive may restart."""
+        drive, other = enabled.devices[1:]
+        drive.objects[0x6007, 0].value = 0
+        drive._enter(Nmt.PRE_OPERATIONAL)
+        drive._send(0x700 + drive.node, bytes([Nmt.PRE_OPERATIONAL]))
+        enabled.bus.faults.add("B silent")
+        assert str(enabled.cycles(2500).unready[1]) == "drive B does not answer"
+        if another:
+            other.restart(enabled.clock())
+            assert enabled.cycles(1500).unready[2] is None
+        if not told:
+            drive.restart(enabled.clock())
+            enabled.cycles(30)
+        enabled.bus.faults.clear()
+        if told:
+            drive.restart(enabled.clock())
+        assert enabled.cycles(2000).unready == (None, None, None)
+        enabled.drives.reset()
+        enabled.cycles(50)
+        assert enabled.enable().state == (P.OPERATION_ENABLED,) * 3
+
     def test_a_full_queue_is_told_once_and_stops_first_what_must_stop(self, enabled: Rig) -> None:
         enabled.bus.broken = True
         assert "ip link set simulated drives txqueuelen 100" in enabled.cycle().warnings[0]

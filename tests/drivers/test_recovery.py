@@ -358,7 +358,7 @@ def test_an_odrive_whose_position_is_relative_is_not_homed_after_a_restart() -> 
     answer = rig.goal("g", 0.01, 0.0, 0.0)
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
-    assert rig.said("slider A: the position is unknown because the drive was off")
+    assert rig.said("slider A: the position is unknown because the drive was configured again")
     answer = rig.command("home")
     assert isinstance(answer, Refused)
     assert answer.message.endswith("to accept the positions as they are, restart the service")
@@ -418,7 +418,7 @@ def test_an_incremental_encoder_makes_the_robot_not_homed() -> None:
     answer = rig.goal("g", 0.01, 0.0, 0.0)
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
-    assert rig.said("slider A: the position is unknown because the drive was off; send home")
+    assert rig.said("slider A: the position is unknown because the drive was configured again; send home")
     assert isinstance(rig.command("home"), CommandDone)
     rig.goal("g2", 0.01, 0.0, 0.0)
     rig.until(lambda: ("g2", "done") in rig.outcomes())

@@ -126,11 +126,6 @@ class Cia402Axis(Axis):
         """
         return super().configured and not self.left_operational
 
-    @property
-    def accepts_outputs(self) -> bool:
-        """Whether digital outputs are sent to the drive: it is configured, or has only left NMT operational."""
-        return self.configured or self.left_operational
-
     def forget_power_state(self) -> None:
         """Forget the last power state, and stop looking for positions of another node, since a new set-up begins."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
@@ -466,7 +461,7 @@ class Cia402Axis(Axis):
         """Return a fault if the drive still has power some time after a command such as "disable".
 
         `seconds` is the time since the command [s], and `wanted` is the name of the command. Return None for a drive
-        in fault or not operational, because another fault already reports that drive.
+        in fault, because another fault already reports that drive.
         """
         if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
             return None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 import can
@@ -226,7 +226,7 @@ class Cia402(Driver[Cia402Axis]):
                 axis.lose(stopping=self._off_deadline != math.inf)
             mistaken = axis.end_cycle()
             end_reading(axis)
-            if self._wire.fault is not None and axis.configured:
+            if self._wire.fault is not None and axis.present:
                 axis.watch_silence(now, self._period)
             if mistaken is not None and self._wire.fault is mistaken:
                 self._wire.fault = axis.event
@@ -248,12 +248,17 @@ class Cia402(Driver[Cia402Axis]):
         """
         now = self._clock()
         self._wire.receive(now)
-        for axis in self._axes:
-            if now >= axis.poll_due:  # neither an EMCY nor an NMT state shows whether a drive has power
+        self._ask_for_statuswords(self._axes)
+        return self._feedback()
+
+    def _ask_for_statuswords(self, axes: Iterable[Cia402Axis]) -> None:
+        """Request statuswords by SDO, as neither an EMCY nor an NMT state shows whether a drive has power."""
+        now = self._clock()
+        for axis in axes:
+            if now >= axis.poll_due:
                 self._enable_sdo(axis)
                 self._ask(axis, canopen_frames.STATUSWORD_UPLOAD)
                 axis.poll_due = now + canopen_frames.POLL_PERIOD
-        return self._feedback()
 
     def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
         a, b, c = self._axes
@@ -322,7 +327,7 @@ class Cia402(Driver[Cia402Axis]):
             silent = axis.missed >= self._drives.missed_positions
             if silent if by_pdo else axis.forget_lost_requests(now):
                 axis.outputs_sent = NOTHING_SENT
-            if not (outputs_pending(axis) and axis.accepts_outputs):
+            if not (outputs_pending(axis) and axis.present):
                 continue
             if by_pdo:
                 put_outputs(axis, self._tables.outputs.frames[number, DATA_AT:])
@@ -339,7 +344,7 @@ class Cia402(Driver[Cia402Axis]):
     def _make_outputs_safe(self) -> None:
         """Write the safe values of the outputs and wait for the answers. SDOs also work in NMT pre-operational."""
         self.set_outputs([axis.io.safe for axis in self._axes])
-        asked = [axis for axis in self._axes if axis.has_outputs and axis.accepts_outputs]
+        asked = [axis for axis in self._axes if axis.has_outputs and axis.present]
         self._await_answers(asked)  # a server handles one request at a time (CiA 301)
         for axis in asked:
             word = canopen_frames.OUTPUTS.pack(axis.outputs | axis.outputs_kept)
@@ -553,6 +558,7 @@ class Cia402(Driver[Cia402Axis]):
 
     def _continue_stop(self) -> None:
         self._command()
+        self._ask_for_statuswords(axis for axis in self._axes if axis.left_operational and not axis.unanswered)
 
     @staticmethod
     def _describe_protection(protection: str) -> str:

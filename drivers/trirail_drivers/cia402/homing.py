@@ -20,6 +20,7 @@ from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import Cia402Axis
+from trirail_drivers.cia402.process_data import INTERPOLATED_POSITION
 from trirail_drivers.interface import DriveFault, PowerState
 
 HOMING = 6
@@ -143,11 +144,14 @@ class HomingSequence:
             yield from self._follow_setpoints(axis)
 
     def _home(self, axis: Cia402Axis, homing: config.Homing) -> Steps:
-        axis.cyclic = axis.follows = False
-        # Bit 4 of the controlword, which enables interpolation in mode 7, starts homing in mode 6. The drive must have
-        # received a controlword without this bit before its mode changes.
-        yield from self._wait_for_syncs(axis)
+        axis.cyclic = False
+        if axis.exchange.mode == INTERPOLATED_POSITION:
+            # Bit 4 of the controlword, which enables interpolation, starts homing in mode 6. The drive must have
+            # received a controlword without this bit before its mode changes.
+            axis.follows = False
+            yield from self._wait_for_syncs(axis)
         yield from self._change_mode(axis, HOMING)
+        axis.follows = False
         # The newest statusword may have been sent in another mode, in which its bits have other meanings.
         yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.seen_clear = ~axis.statusword

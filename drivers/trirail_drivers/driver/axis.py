@@ -104,9 +104,14 @@ class Axis(Answers):
         return Counts(self.late, self.lost, self.setpoints_late, self.setpoints_lost)
 
     @property
+    def present(self) -> bool:
+        """Whether the drive has neither restarted nor fallen silent since its set-up."""
+        return not (self.restarted or self.silent)
+
+    @property
     def configured(self) -> bool:
         """Whether the drive's set-up is still valid; setpoints are sent to it only then."""
-        return not (self.restarted or self.silent)
+        return self.present
 
     @property
     def last_heard(self) -> float:

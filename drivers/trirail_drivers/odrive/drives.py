@@ -164,7 +164,7 @@ class Odrive(Driver[OdriveAxis]):
         self._wire.receive(now)
         for axis in self._axes:
             end_reading(axis)
-            if self._wire.fault is not None and axis.configured:
+            if self._wire.fault is not None and axis.present:
                 axis.watch_silence(now, self._period)
         if self._wire.fault is None:
             fault = self._find_fault(now)

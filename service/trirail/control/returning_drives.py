@@ -88,7 +88,7 @@ class ReturningDrives:
             words = f"drive {label} is configured, and so are the others: send reset, then enable"
             yield "info", coded(words, EventCode.DRIVES_READY, drive=label)
         if not feedback.homed[i]:
-            words = f"slider {label}: the position is unknown because the drive was off; send home"
+            words = f"slider {label}: the position is unknown because the drive was configured again; send home"
             yield "warning", coded(words, EventCode.POSITION_UNKNOWN, slider=label)
         elif last is not None and abs(position - last) > self._windows[i]:
             moved = (

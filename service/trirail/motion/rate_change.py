@@ -31,7 +31,7 @@ PROMPTNESS = 3.0
 MIN_STOP_S = 0.1
 """Duration that such a change may always have [s]."""
 MAX_JERK = 1e9
-"""Jerk that stands for no limit [m/s³, rad/s³]."""
+"""Jerk that is used where a goal has no limit [m/s³, rad/s³]."""
 MAX_POSTPONEMENTS = 3
 """Greatest number of times that the start of a law is postponed, to leave enough cycles for sampling the whole law."""
 
