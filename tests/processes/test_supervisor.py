@@ -7,6 +7,7 @@ import itertools
 import os
 import random
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import pytest
