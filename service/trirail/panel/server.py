@@ -65,8 +65,9 @@ LANGUAGES = "languages.json"
 """Name of the file with the languages of the page: the code of each language, and its name in the same language."""
 SESSIONS, RECORDING, REPORT = "sessions", "recording", "report"
 """Names after the token in the paths of requests for recordings."""
-REQUEST_TIMEOUT_S = 5.0
-"""Time limit for receiving a request from this machine [s]."""
+REQUEST_TIMEOUT_S = 20.0
+"""Time limit for receiving a request from this machine [s]. Afterwards, the connection is closed without a response,
+which must not happen only because the machine is busy."""
 TYPES = {
     "html": "text/html",
     "css": "text/css",
