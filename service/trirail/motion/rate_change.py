@@ -30,8 +30,6 @@ PROMPTNESS = 3.0
 """Greatest duration of a change to a lower rate within a goal's own limits, in durations of a stop within them."""
 MIN_STOP_S = 0.1
 """Duration that such a change may always have [s]."""
-MAX_JERK = 1e9
-"""Jerk that is used where a goal has no limit [m/s³, rad/s³]."""
 MAX_POSTPONEMENTS = 3
 """Greatest number of times that the start of a law is postponed, to leave enough cycles for sampling the whole law."""
 
@@ -126,7 +124,8 @@ class RateChange:
         self._motion_key = schedule.version, len(schedule.runs)
         self._possible = self.rate
         self._share = 0
-        self._excess = OWN_EXCESSES[-1 if self._stops else 0]
+        self._excesses = iter((math.inf,) if self._stops else OWN_EXCESSES)
+        self._excess = next(self._excesses)
         self._candidate: _Candidate | None = None
         self._unsampled: list[_Part] | None = None
         self._first_s = 0.0
@@ -197,7 +196,7 @@ class RateChange:
     def _next_share(self) -> None:
         self._candidate, self._share = None, (self._share + 1) % len(CHANGE_SHARES)
         if self._share == 0 and self.lowers_rate:
-            self._excess = OWN_EXCESSES[min(OWN_EXCESSES.index(self._excess) + 1, len(OWN_EXCESSES) - 1)]
+            self._excess = next(self._excesses, math.inf)
 
     def _is_prompt(self, law: Path) -> bool:
         """Return whether a change to a lower rate takes at most PROMPTNESS times as long as a stop within own limits.
@@ -207,7 +206,7 @@ class RateChange:
         own = self._schedule.runs[-1].own.limits
         if own is None or not self.lowers_rate or self._excess == math.inf:
             return True
-        acceleration, jerk = own[:, 1], np.minimum(own[:, 2], MAX_JERK)
+        _, acceleration, jerk = own.T
         stop = np.abs(self._schedule.commanded.velocity) / acceleration
         stop += np.where(np.isfinite(acceleration), acceleration, 0.0) / jerk
         return float(law.knots[-2]) <= PROMPTNESS * float(stop.max()) + MIN_STOP_S
