@@ -160,15 +160,23 @@ def test_a_goal_keeps_its_own_limits_while_its_rate_changes(seed: int) -> None:
     assert jerk <= 1.01 * BRAKING_EXCESS
 
 
+@pytest.mark.parametrize(("acceleration", "jerk", "share"), [(0.02, 0.05, 0.1), (0.02, 0.05, 0.4), (1.0, 10.0, 0.2)])
+def test_where_own_limits_are_used_completely_a_pause_is_soon(acceleration: float, jerk: float, share: float) -> None:
+    assert_pauses_soon(acceleration, jerk, share)
+
+
 @pytest.mark.generated(*range(12))
-def test_a_goal_with_own_limits_pauses_soon_wherever_it_is_and_keeps_them_when_it_is_resumed(seed: int) -> None:
+def test_a_goal_with_own_limits_pauses_soon_wherever_it_is(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    acceleration, jerk = 10.0 ** rng.uniform(-1.0, 0.0), 10.0 ** rng.uniform(0.5, 1.5)
+    assert_pauses_soon(10.0 ** rng.uniform(-1.5, 0.0), 10.0 ** rng.uniform(-1.0, 1.5), rng.uniform(0.02, 0.85))
+
+
+def assert_pauses_soon(acceleration: float, jerk: float, share: float) -> None:
+    """Pause a goal with own limits at a share of its path, and resume it: then it keeps them."""
     own = OwnLimits(velocity=(0.2, 0.2, 1.0), acceleration=(acceleration,) * 2 + (5.0,), jerk=(jerk,) * 2 + (50.0,))
     session = Session()
     session.post("g", PoseGoal(0.1, 0.0, 0.0, limits=own))
     session.until(lambda: bool(session.control.schedule.runs))
-    share = rng.uniform(0.02, 0.85)
     session.until(lambda: session.control.schedule.runs[0].progress >= share, 20_000)
     begun = len(session.records)
     speed = session.records["commanded_pose_velocity"][-1, 0]
