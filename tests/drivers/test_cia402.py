@@ -776,3 +776,33 @@ def test_a_node_that_missed_its_start_is_configured_again(ready: Rig, refused: b
         feedback = ready.cycles(1000)
         assert not any(feedback.unready)
     assert (a.nmt, feedback.fault) == (Nmt.OPERATIONAL, None)
+
+
+@pytest.mark.parametrize("waits", range(4))
+def test_a_reset_before_the_first_position_after_a_restart_suffices(ready: Rig, waits: int) -> None:
+    """The drive is not configured a second time, and the fault of the restart ends."""
+    ready.cycles(5)
+    ready.devices[0].restart(ready.clock.now)
+    assert ready.cycles(5).unready[0] is not None
+    receive, node = ready.bus.recv, ready.devices[0].node
+
+    def without_positions(timeout: float | None = None) -> can.Message | None:
+        """The drive's positions and heartbeats arrive late, its answers to requests do not."""
+        while (message := receive(timeout)) is not None and message.arbitration_id & 0x7F == node:
+            if message.arbitration_id == canopen_frames.SDO_ANSWER + node:
+                break
+        return message
+
+    vars(ready.bus).update(recv=without_positions)
+    while ready.cycle().unready[0] is not None:
+        pass
+    for _ in range(waits):
+        ready.cycle()
+    ready.drives.reset()
+    ready.cycle()
+    vars(ready.bus).update(recv=receive)
+    ready.cycle()
+    ready.drives.reset()  # of "no position", if the drive was awaited for long enough
+    for _ in range(200):
+        assert ready.cycle().unready[0] is None
+    assert ready.cycle().fault is None

@@ -11,7 +11,7 @@ from trirail_drivers.cia402.duplicate_node import AnswersAfterStop, AnswersPerSy
 from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import DigitalIo, Drives
-from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.axis import SILENT_AFTER, Axis
 from trirail_drivers.driver.axis_row import NOTHING_SENT
 from trirail_drivers.driver.cyclic import expected_row
 from trirail_drivers.driver.row_updates import accept_counts, accept_statusword
@@ -400,10 +400,11 @@ class Cia402Axis(Axis):
         if self.state is PowerState.OPERATION_ENABLED:
             self.state = PowerState.SWITCHED_ON
 
-    @property
-    def has_missed_start(self) -> bool:
-        """Whether the drive answers no SYNC and has not been seen in NMT operational since it was started last."""
-        return self.missed > 0 and not self._operational
+    def has_missed_start(self, period: float) -> bool:
+        """Whether the drive has not been seen in NMT operational since it was started, and has had time to answer a
+        SYNC. `period` is the cycle period [s].
+        """
+        return not self._operational and self.missed * period > SILENT_AFTER
 
     @property
     def may_miss_pdos(self) -> bool:

@@ -458,7 +458,7 @@ class Cia402(Driver[Cia402Axis]):
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._start_stop_timer("reset")
         for axis in self._axes:
-            if axis.configured and axis.has_missed_start:
+            if axis.configured and axis.has_missed_start(self._period):
                 axis.leave_operational()
             if axis.configured:
                 axis.clear_faults(now)
