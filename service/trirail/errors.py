@@ -219,7 +219,7 @@ class RefusalCode(StrEnum):
         "another service in the network has the same robot name, so both robots would move",
         "give each robot its own name; stops always work",
     )
-    STOPPED = "stopped", "a stop arrived before the goal started", "send the goal again"
+    STOPPED = "stopped", "a stop arrived before the goal or command was carried out", "send it again"
     FAULTED = (
         "faulted",
         "a fault occurred before the goal started",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import time
 import unicodedata
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from trirail.errors import RefusedError
 from trirail.processes.gateway import ROUTES, Gateway
 from trirail.processes.incoming import Incoming
 from trirail.processes.memory_budget import OVERHEAD
+from trirail.processes.replies import Refusals
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, links, packets, records, text, zenoh_session
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
@@ -205,7 +205,7 @@ def test_the_gateway_takes_any_message(
     gateway: tuple[Gateway, FakeLink], kind: str, key: str, payload: bytes, encoding: str
 ) -> None:
     served, link = gateway
-    served._refusals._announced_since = -math.inf
+    served._refusals = Refusals(link, served._replies)  # type: ignore[arg-type]  # announces every refusal
     link.sent.clear()
     served._handle(Incoming(kind, key, len(payload), payload, encoding, None, time.monotonic_ns()))
     for packet in link.sent:

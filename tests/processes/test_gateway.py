@@ -18,8 +18,8 @@ import zenoh
 from control_rig import CONFIG, carried
 from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
-from trirail.processes.incoming import GOAL_PATIENCE, GOALS_OF_ONE, Incoming
-from trirail.processes.replies import REFUSALS_PER_SECOND
+from trirail.processes.incoming import GOAL_PATIENCE, GOALS_OF_ONE, MAX_COMMAND_WAIT, Incoming
+from trirail.processes.replies import REFUSALS_OF_USER
 from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER, REPLY_TIMEOUT_S
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
@@ -76,8 +76,9 @@ class Rig:
         content = json.dumps({"kind": "pose", "x": 0, "y": 0, "phi": 0, "id": name}).encode()
         self.gateway._handle(came("goal", f"trirail/demo/goal/{user}", content, number))
 
-    def command(self, name: str, content: bytes = b"", user: str = "ann", number: int = 0) -> None:
-        self.gateway._handle(came("cmd", f"trirail/demo/cmd/{user}/{name}", content, number))
+    def command(self, name: str, content: bytes = b"", user: str = "ann", number: int = 0, waited: float = 0.0) -> None:
+        incoming = came("cmd", f"trirail/demo/cmd/{user}/{name}", content, number)
+        self.gateway._handle(incoming._replace(arrived_ns=incoming.arrived_ns - round(waited * 1e9)))
 
     def hear(self, answer: Answer) -> None:
         """The loop says something."""
@@ -130,6 +131,44 @@ def test_what_has_waited_is_as_old_as_its_arrival_and_a_targets_age_is_that_of_t
 def test_every_command_is_passed_on(rig: Rig, name: Command) -> None:
     rig.command(name, boundary.encode(carried(name)))
     assert rig.sent == [CommandRequest(1, "ann", name, carried(name))]
+
+
+@pytest.mark.parametrize("name", Command)
+def test_a_command_that_has_waited_long_is_refused_unless_it_stops_or_concerns_the_lease(
+    rig: Rig, name: Command
+) -> None:
+    rig.command(name, boundary.encode(carried(name)), waited=MAX_COMMAND_WAIT + 0.1)
+    late = name.stops or name in (Command.ACQUIRE, Command.RELEASE)
+    assert [request.name for request in rig.commands()] == [name] * late
+    assert [notice.code for notice in rig.refusals()] == [RefusalCode.TIMEOUT] * (not late)
+
+
+@pytest.mark.parametrize("stop", [Command.STOP, Command.DISABLE, Command.QUICK_STOP, Command.PAUSE])
+@pytest.mark.parametrize("name", Command)
+def test_a_command_that_starts_something_is_not_carried_out_behind_a_later_stop(
+    rig: Rig, name: Command, stop: Command
+) -> None:
+    rig.command(stop, user="bob", number=5)
+    for number in (4, 6):
+        rig.command(name, boundary.encode(carried(name)), number=number)
+    refused_one = name in (Command.ENABLE, Command.HOME, Command.RESUME, Command.RESET)
+    assert [request.name for request in rig.commands()] == [stop, *[name] * (2 - refused_one)]
+    assert [notice.code for notice in rig.refusals()] == [RefusalCode.STOPPED] * refused_one
+
+
+def test_a_stop_of_one_goal_overtakes_no_other_command(rig: Rig) -> None:
+    rig.command("stop", b'{"goal": "g"}', user="bob", number=5)
+    rig.command("enable", number=4)
+    assert [request.name for request in rig.commands()] == ["stop", "enable"]
+
+
+@pytest.mark.parametrize("kind", ["teach", "forget"])
+def test_poses_are_neither_taught_late_nor_under_anothers_lease(rig: Rig, kind: str) -> None:
+    incoming = came(kind, f"trirail/demo/{kind}/ann/pick", b"")
+    rig.gateway._handle(incoming._replace(arrived_ns=incoming.arrived_ns - round((MAX_COMMAND_WAIT + 0.1) * 1e9)))
+    rig.hear(Status(None, 1.0, None, lease="bob"))
+    rig.gateway._handle(came(kind, f"trirail/demo/{kind}/ann/pick", b""))
+    assert [notice.code for notice in rig.refusals()] == [RefusalCode.TIMEOUT, RefusalCode.LEASED]
 
 
 @pytest.mark.parametrize("name", Command)
@@ -353,7 +392,7 @@ def test_what_is_refused_of_one_who_floods_leaves_room_to_tell_of_the_others(rig
         rig.command("dance", user="eve")
     rig.command("dance", user="ann")
     told = [request.user for request in rig.refusals()]
-    assert told == ["eve"] * REFUSALS_PER_SECOND + ["ann"]
+    assert told == ["eve"] * REFUSALS_OF_USER + ["ann"]
 
 
 @pytest.mark.parametrize("role", [Role.OPERATOR, Role.MAINTAINER])

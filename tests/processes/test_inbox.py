@@ -21,6 +21,7 @@ from trirail.processes.memory_budget import OVERHEAD
 from trirail.wire import zenoh_session
 from trirail.wire.messages import ErrorReply
 from trirail.wire.sizes import MAX_BESIDE, MAX_MESSAGE, MAX_TRANSPORT, MAX_UNREAD, MAX_UNREAD_OF_ONE
+from trirail.wire.stop_protocol import StopRequest
 from trirail.wire.vocabulary import Command
 from waiting import WITHIN
 
@@ -77,6 +78,23 @@ def test_the_flood_of_one_leaves_room_for_the_others(inbox: Inbox, refused: list
     keep(inbox, "goal")
     assert len(refused) == 5
     assert [incoming.user for incoming in inbox.next_messages(3)] == ["eve", "ann", "eve"]
+
+
+@pytest.mark.generated(0, 1, 2)
+def test_no_flood_of_other_messages_keeps_out_a_stop(inbox: Inbox, refused: list[Incoming], seed: int) -> None:
+    """Whether it fills the memory, the number of messages, or what one user may have."""
+    chance = random.Random(seed)
+    users = [f"u{number}" for number in range(chance.choice((1, 4, 20)))]
+    size = chance.choice((0, 0, 100_000))
+    for _ in range(3 * MAX_MESSAGES):
+        kind, name = chance.choice((("cmd", "enable"), ("cmd", "override"), ("goal", "")))
+        keep(inbox, kind, bytes(size), chance.choice(users), name)
+    assert refused
+    before = len(refused)
+    for number, name in enumerate(("stop", "quick_stop", "disable") * 5):
+        keep(inbox, "cmd", b"{}", (*users, "ann")[number % (len(users) + 1)], name)
+        inbox.stop_at_port(StopRequest(f"trirail/demo/cmd/ann/{name}", "", ""), lambda _: None)
+    assert len(refused) == before
 
 
 @pytest.mark.parametrize("name", Command)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +11,8 @@ import pytest
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes import replies as refusals
 from trirail.processes.incoming import Incoming
-from trirail.processes.replies import REFUSALS_OF_ALL, REFUSALS_PER_SECOND, Refusals
+from trirail.processes.publications import EVENTS_KEPT
+from trirail.processes.replies import REFUSALS_OF_ALL, REFUSALS_OF_USER, REFUSALS_OF_USER_PER_SECOND, Refusals
 from trirail.wire import packets
 from trirail.wire.messages import ErrorReply
 
@@ -37,22 +39,32 @@ def listener(monkeypatch: pytest.MonkeyPatch) -> Listener:
     return Listener(monkeypatch)
 
 
-def test_each_refusal_is_answered_and_a_user_s_are_told_so_many_times_a_second(listener: Listener) -> None:
-    for _ in range(3 * REFUSALS_PER_SECOND):
+def test_each_refusal_is_answered_and_so_many_of_a_user_are_announced(listener: Listener) -> None:
+    for _ in range(3 * REFUSALS_OF_USER):
         listener.refuse("ann")
     listener.refuse("bob")
-    assert listener.answers == [ErrorReply(RefusalCode.BUSY, "send fewer")] * (3 * REFUSALS_PER_SECOND + 1)
-    assert [said.user for said in listener.told] == ["ann"] * REFUSALS_PER_SECOND + ["bob"]
+    assert listener.answers == [ErrorReply(RefusalCode.BUSY, "send fewer")] * (3 * REFUSALS_OF_USER + 1)
+    assert [said.user for said in listener.told] == ["ann"] * REFUSALS_OF_USER + ["bob"]
     assert {said.message for said in listener.told} == {"send fewer"}
-    listener.now += 0.99
-    listener.refuse("ann")
-    assert len(listener.told) == REFUSALS_PER_SECOND + 1
-    listener.now += 0.02
-    listener.refuse("ann")
-    assert len(listener.told) == REFUSALS_PER_SECOND + 2
+    for number in (1, 2, 3):
+        listener.now += 1.0 / REFUSALS_OF_USER_PER_SECOND
+        for _ in range(5):
+            listener.refuse("ann")
+        assert len(listener.told) == REFUSALS_OF_USER + 1 + number
 
 
-def test_of_all_users_together_so_many_are_told_a_second(listener: Listener) -> None:
+@pytest.mark.generated(0, 1, 2)
+def test_a_day_of_refusals_leaves_other_events_in_the_history(listener: Listener, seed: int) -> None:
+    """A client that sends invalid goals day and night displaces half of the history in a quarter of an hour at most."""
+    chance = random.Random(seed)
+    end = listener.now + 900.0
+    while listener.now < end:
+        listener.now += chance.expovariate(5.0)
+        listener.refuse(f"user{chance.randrange(1 + seed)}")
+    assert len(listener.told) < EVENTS_KEPT / 2
+
+
+def test_of_all_users_together_so_many_are_announced(listener: Listener) -> None:
     for number in range(2 * REFUSALS_OF_ALL):
         listener.refuse(f"user{number}")
     assert len(listener.told) == REFUSALS_OF_ALL

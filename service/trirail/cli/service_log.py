@@ -116,7 +116,7 @@ class Log:
             return
         if self._left_out:
             number, self._left_out = self._left_out, 0
-            self.log(f"{number} events came too quickly to be written here: `trirail events` has them", "warning")
+            self.log(f"{number} events came too quickly to be written here: `trirail events` has the newest", "warning")
             self._room -= 1.0
         self._room -= 1.0
         self.text(self._line(event.time, event.level, event.message, event))

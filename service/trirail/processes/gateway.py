@@ -214,7 +214,11 @@ class Gateway:
         return RoleReply(user, self._guard.role(user))
 
     def _edit_poses(self, message: RoutedMessage) -> None:
-        self._poses.edit(message.incoming, *message.names)
+        user, pose = message.names
+        if (holder := self._states.lease) not in (None, user):
+            raise RefusedError(RefusalCode.LEASED, f"{holder} holds the lease: other users cannot change poses")
+        message.incoming.check_age()
+        self._poses.edit(message.incoming, user, pose)
 
     def _command(self, message: RoutedMessage) -> None:
         _, command = message.names

@@ -26,10 +26,10 @@ from trirail.wire.text import is_id
 MAX_MESSAGES = 8192
 """Maximum number of unread messages; further messages are refused.
 
-Twice as many are allowed for commands, so that goals cannot prevent a stop.
+Twice as many are allowed for commands, and three times as many for stops, so that no other message can prevent a stop.
 """
 MAX_MESSAGES_OF_USER = 2048
-"""Maximum number of unread messages of one user. Twice as many are allowed for commands."""
+"""Maximum number of unread messages of one user. More are allowed for commands and for stops, as above."""
 TOO_MUCH = "too many unread messages: send fewer"
 MAX_MERGED_STOPS = 32
 """Maximum number of consecutive equal stops of one user that are merged into one."""
@@ -192,7 +192,7 @@ class Inbox:
 
     def _has_kept(self, incoming: Incoming) -> bool:
         """Enqueue a message and return True, or return False if there is no space for it."""
-        user, room = incoming.user, 2 if incoming.kind == "cmd" else 1
+        user, room = incoming.user, 3 if _stops(incoming) else 2 if incoming.kind == "cmd" else 1
         hold = self._budget.hold(user, incoming.held, room)
         if hold is None:
             return False

@@ -83,11 +83,22 @@ class Incoming(NamedTuple):
         boundary.check_size(self.size)
         return boundary.decode(self.payload, kind, what, self.encoding)
 
+    def check_age(self) -> None:
+        """Raise RefusedError if the message has waited too long, so that its sender may no longer expect its effect."""
+        if time.monotonic_ns() - self.arrived_ns > MAX_COMMAND_WAIT * 1e9:
+            raise RefusedError(
+                RefusalCode.TIMEOUT,
+                f"not carried out: it waited longer than {MAX_COMMAND_WAIT:g} s for earlier messages or because the "
+                "machine was busy: send it again",
+            )
+
     def unanswered(self) -> Incoming:
         """Return a copy of the message that will not be answered."""
         return self._replace(query=None, at_door=None, alike=(), pair=None, held=len(self.payload) + OVERHEAD)
 
 
+MAX_COMMAND_WAIT = 2.0
+"""Maximum time that a command waits for earlier messages [s], except a stop and a renewal of the lease."""
 BURST = 400
 """Number of messages of one user that may be read in a burst."""
 RATE = 200.0
@@ -264,6 +275,12 @@ class Backlog:
         if before >= self._stop[0]:  # stops may be read in an order other than that of their arrival
             self._stop = before, reason
         self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.incoming.number < before else goal)
+
+    def check_stops(self, number: int) -> None:
+        """Raise RefusedError if a stop of all goals has overtaken the message with this `number`."""
+        before, reason = self._stop
+        if number < before:
+            raise RefusedError(RefusalCode.STOPPED, f"not carried out: {reason} arrived later and came first")
 
     def withdraw_others(self, user: str | None, reason: str) -> None:
         """Withdraw the goals of all users except `user`."""

@@ -11,14 +11,14 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 
 import msgspec
 import zenoh
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.incoming import Incoming, StopPair
+from trirail.processes.incoming import Incoming, Pace, StopPair
 from trirail.processes.memory_budget import Budget
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.event_codes import EventCode
@@ -218,13 +218,14 @@ class Replies:
                 query.reply(key, payload, encoding=encoding)
 
 
-REFUSALS_PER_SECOND = 10
-"""Maximum number of refusals per second and user that are announced to all clients.
+REFUSALS_OF_USER, REFUSALS_OF_USER_PER_SECOND = 10, 0.2
+"""Number of refusals of one user that are announced to all clients in a burst, and afterwards per second.
 
-The sender of a refused message receives an error reply in any case.
+The sender of a refused message receives an error reply in any case. More announcements would displace other events from
+the history.
 """
-REFUSALS_OF_ALL = 50
-"""Maximum number of refusals per second of all users that are announced to all clients."""
+REFUSALS_OF_ALL, REFUSALS_OF_ALL_PER_SECOND = 50, 0.4
+"""Number of refusals of all users that are announced to all clients in a burst, and afterwards per second."""
 
 
 class Refusals:
@@ -233,8 +234,11 @@ class Refusals:
     def __init__(self, link: PacketLink, replies: Replies) -> None:
         self._link = link
         self._replies = replies
-        self._announced: Counter[str] = Counter()
-        self._announced_since = 0.0
+        self._paces = (
+            Pace(REFUSALS_OF_USER, REFUSALS_OF_USER_PER_SECOND),
+            Pace(REFUSALS_OF_ALL, REFUSALS_OF_ALL_PER_SECOND),
+        )
+        """Rate limits of the announcements for each user, and for all users together."""
         self._unkept: deque[tuple[str, ErrorReply]] = deque(maxlen=REFUSALS_OF_ALL)
         self._budget = Budget(MAX_REFUSED, MAX_REFUSED)
 
@@ -266,11 +270,9 @@ class Refusals:
 
     def warn_everyone(self, text: str, user: str = "", code: RefusalCode = RefusalCode.INTERNAL) -> None:
         """Ask the loop to announce a refusal, at a limited rate."""
-        now = time.monotonic()
-        if now - self._announced_since >= 1.0:
-            self._announced.clear()
-            self._announced_since = now
-        if self._announced[user] < REFUSALS_PER_SECOND and self._announced.total() < REFUSALS_OF_ALL:
-            self._announced[user] += 1
+        now, (of_user, of_all) = time.monotonic(), self._paces
+        if not (of_user.wait(user, now) or of_all.wait("", now)):
+            of_user.count(user, now)
+            of_all.count("", now)
             notice = Notice("refused", "warning", text, user=user, code=code, event_code=EventCode.REFUSED)
             self._link.send(message(Announcement(notice)))

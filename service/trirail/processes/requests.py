@@ -285,6 +285,10 @@ class CommandReader:
         if goal is not None and withdrawn and not self._requests.in_loop(goal):
             self._replies.answer(incoming, self._stopped())
             return
+        if name.starts:
+            backlog.check_stops(incoming.number)
+        if not (name.stops or name.ignores_lease):  # a late renewal must not end a lease
+            incoming.check_age()
         ticket = self._requests.command(incoming, user, name, content)
         if goal is not None and (withdrawn or self._inbox.earlier(incoming.number) or self._parts.is_incomplete(goal)):
             self._of_unread.add(ticket)

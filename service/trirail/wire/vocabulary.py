@@ -159,6 +159,7 @@ class _CommandRow(NamedTuple):
     content: type[CommandContent] = NoContent
     stops: bool = False
     ignores_lease: bool = False
+    starts: bool = False
 
 
 class Command(StrEnum):
@@ -179,8 +180,10 @@ class Command(StrEnum):
     before the command do not start."""
     ignores_lease: bool
     """Whether every user may send the command while another user holds the lease."""
+    starts: bool
+    """Whether the command starts motion or is a step towards it. It is refused if a later stop has overtaken it."""
 
-    ENABLE = _CommandRow("enable", "Enable the drives and hold the position.", Role.OPERATOR)
+    ENABLE = _CommandRow("enable", "Enable the drives and hold the position.", Role.OPERATOR, starts=True)
     DISABLE = _CommandRow("disable", "Stop, then disable the drives.", Role.OPERATOR, stops=True, ignores_lease=True)
     STOP = _CommandRow("stop", "Stop the robot within its limits.", Role.VIEWER, Stop, stops=True, ignores_lease=True)
     QUICK_STOP = _CommandRow(
@@ -190,14 +193,17 @@ class Command(StrEnum):
         stops=True,
         ignores_lease=True,
     )
-    RESET = _CommandRow("reset", "Clear a fault whose cause is removed; the drives stay disabled.", Role.MAINTAINER)
+    RESET = _CommandRow(
+        "reset", "Clear a fault whose cause is removed; the drives stay disabled.", Role.MAINTAINER, starts=True
+    )
     HOME = _CommandRow(
         "home",
         "Home the sliders without absolute encoders.",
         Role.MAINTAINER,
+        starts=True,
     )
     PAUSE = _CommandRow("pause", "Stop on the path and keep the goal.", Role.OPERATOR, stops=True)
-    RESUME = _CommandRow("resume", "Continue a paused goal.", Role.OPERATOR)
+    RESUME = _CommandRow("resume", "Continue a paused goal.", Role.OPERATOR, starts=True)
     OVERRIDE = _CommandRow(
         "override",
         "Set the speed override (0, or 1 to 200 %).",
@@ -228,12 +234,13 @@ class Command(StrEnum):
         content: type[CommandContent] = NoContent,
         stops: bool = False,
         ignores_lease: bool = False,
+        starts: bool = False,
     ) -> Self:
         """Create a member from its row. A call with only a name, such as Command("stop"), looks the member up."""
         member = str.__new__(cls, name)
         member._value_ = name
         member.help, member.role, member.content = help, role, content
-        member.stops, member.ignores_lease = stops, ignores_lease
+        member.stops, member.ignores_lease, member.starts = stops, ignores_lease, starts
         return member
 
     @property
