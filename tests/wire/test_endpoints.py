@@ -90,7 +90,7 @@ HOSTS = st.ip_addresses().map(lambda at: f"[{at}]" if at.version == 6 else str(a
 )
 
 
-@given(HOSTS, st.integers(1, 65535), st.sampled_from(("tcp", "tls", "udp", "quic", "ws")), st.sampled_from(ENDS))
+@given(HOSTS, st.integers(1, 65535), st.sampled_from(("tcp", "tls")), st.sampled_from(ENDS))
 def test_what_an_endpoint_lacks_is_said(host: str, port: int, protocol: str, end: str) -> None:
     assert fault_of(f"{protocol}/{host}:{port}{end}") == ""
     assert fault_of(f"{host}:{port}{end}").startswith("the protocol is missing")
@@ -175,3 +175,9 @@ def test_a_port_can_be_listened_on_once_an_address(one: str, other: str, same: b
 )
 def test_an_endpoint_leads_to_what_may_be_the_address_behind_it(endpoint: str, reached: str, does: bool) -> None:
     assert leads_to(endpoint, reached) is does
+
+
+@pytest.mark.parametrize("protocol", ["udp", "quic", "ws", "serial"])
+def test_protocols_without_a_stop_port_are_refused(protocol: str) -> None:
+    """A web page can open a WebSocket on this machine."""
+    assert "use tcp, tls or unixsock-stream" in fault_of(f"{protocol}/127.0.0.1:7447")

@@ -11,7 +11,8 @@ from pathlib import Path
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
 """Endpoint at which a service listens by default."""
 ENDPOINT_SYNTAX = "an endpoint is protocol/address, such as tcp/127.0.0.1:7447"
-_WITH_PORT = frozenset({"tcp", "tls", "udp", "quic", "ws"})
+_WITH_PORT = frozenset({"tcp", "tls"})
+"""Protocols whose endpoints have a port. Others of Zenoh have no stop port, and ws is also open to web pages."""
 _UNIX = "unixsock-stream"
 SOCKET_SYNTAX = f"use an absolute path, such as {_UNIX}//run/trirail/zenoh"
 MAX_SOCKET_PATH = 102
@@ -63,9 +64,9 @@ def _fault_of_path(path: str) -> str:
 
 
 def tcp_address(endpoint: str) -> tuple[str, int] | None:
-    """Return the host and port of an endpoint; None if it is invalid, or if its protocol does not use TCP."""
+    """Return the host and port of an endpoint; None if it is invalid, or if it is a Unix socket."""
     protocol, address = _parts(endpoint)
-    if protocol not in {"tcp", "tls", "ws"} or fault_of(endpoint):
+    if protocol not in _WITH_PORT or fault_of(endpoint):
         return None
     host, _, port = address.rpartition(":")
     return host.strip("[]"), int(port)

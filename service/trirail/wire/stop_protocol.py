@@ -69,12 +69,12 @@ def stop_address(endpoint: str) -> StopAddress | None:
     """Return the address of the stop port that belongs to a Zenoh endpoint.
 
     The address is the endpoint's port plus PORT_OFFSET, or the file of the endpoint's socket with SUFFIX. Return None
-    if the endpoint is invalid or its protocol is not tcp, tls or unixsock-stream.
+    if the endpoint is invalid.
     """
     if (file := socket_file(endpoint)) is not None:
         return StopAddress(f"{file}{SUFFIX}", secured=False)
     address = tcp_address(endpoint)
-    if address is None or endpoint.startswith("ws/"):
+    if address is None:
         return None
     host, port = address
     stop_port = port + PORT_OFFSET if port + PORT_OFFSET <= LAST_PORT else port - PORT_OFFSET
