@@ -250,9 +250,10 @@ def served(config: Config, **telemetry: object) -> tuple[Config, MetricsServer, 
     return config, MetricsServer(config, looked), looked
 
 
-def get(url: str, context: ssl.SSLContext | None = None) -> tuple[int, str]:
+def get(url: str, context: ssl.SSLContext | None = None, accept: str = "*/*") -> tuple[int, str]:
+    request = urllib.request.Request(url, headers={"Accept": accept})
     try:
-        with urllib.request.urlopen(url, timeout=10.0, context=context) as answer:
+        with urllib.request.urlopen(request, timeout=10.0, context=context) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.read().decode()
@@ -293,6 +294,20 @@ def test_metrics_are_those_of_the_collector_and_all_else_is_not_found(local: tup
     assert status == 200
     assert 'trirail_service_info{robot="demo"' in body
     assert get(f"{url}/")[0] == get(f"{url}/metrics/../etc/passwd")[0] == 404
+
+
+@pytest.mark.parametrize(
+    "accept",
+    ["text/plain;version=1.x.0", "application/openmetrics-text; version=zzz", "application/openmetrics-text;version"],
+)
+def test_an_invalid_header_is_answered_and_not_logged(
+    local: tuple[str, Health], accept: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    url, _ = local
+    status, body = get(f"{url}/metrics", accept=accept)
+    assert status in (200, 406)
+    assert ("error" in body) == (status == 406)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.long

@@ -25,7 +25,7 @@ import msgspec
 from msgspec import structs
 from prometheus_client import CollectorRegistry, Metric, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
-from prometheus_client.exposition import ThreadingWSGIServer
+from prometheus_client.exposition import ThreadingWSGIServer, choose_encoder
 from prometheus_client.registry import Collector
 from trirail_drivers.interface import NAMES
 
@@ -240,6 +240,10 @@ class MetricsServer:
             return _respond(start, HTTPStatus.FORBIDDEN, {"error": f"{environ[USER] or 'this client'} has no role"})
         match environ["PATH_INFO"]:
             case "/metrics":
+                try:
+                    choose_encoder(environ.get("HTTP_ACCEPT", ""))  # raises for versions that are not numbers
+                except (TypeError, ValueError):
+                    return _respond(start, HTTPStatus.NOT_ACCEPTABLE, {"error": "the header Accept is not valid"})
                 return self._metrics(environ, start)  # type: ignore[no-any-return]
             case "/healthz":
                 troubles = self._health.troubles()
