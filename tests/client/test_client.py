@@ -18,8 +18,10 @@ from trirail.client.async_client import AsyncRobot
 from trirail.client.client import GoalHandle, Robot
 from trirail.client.goal import AsyncGoalHandle
 from trirail.errors import RefusalCode, ServiceError, WaitTimeoutError
-from trirail.wire.messages import CommandReply, Event
+from trirail.wire import boundary, zenoh_session
+from trirail.wire.messages import CommandReply, Event, RoleReply
 from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import Role
 from trirail.wire.zenoh_session import open_service
 from waiting import WITHIN
 
@@ -176,6 +178,19 @@ def test_the_users_of_a_robot_that_is_not_there_are_an_error(tmp_path: Path) -> 
     locator = f"unixsock-stream/{tmp_path}/zenoh"
     with open_service([locator]), Robot("demo", locator) as robot, pytest.raises(ServiceError, match="no robot 'demo'"):
         robot.users()
+
+
+@pytest.mark.parametrize("token", ["\x1b[31mred", "two\nlines", "x" * 3000, "\u202eabc"])
+def test_only_names_are_users(tmp_path: Path, token: str) -> None:
+    """Any session may declare a token with any name."""
+    locator = f"unixsock-stream/{tmp_path}/zenoh"
+    key = zenoh_session.key("demo", "role", "*")
+    with open_service([locator]) as session, Robot("demo", locator) as robot:
+        role = boundary.encode(RoleReply(robot.user, Role.OPERATOR))
+        queryable = session.declare_queryable(key, lambda query: query.reply(query.key_expr, role))
+        declared = session.liveliness().declare_token(zenoh_session.key("demo", "here", token))
+        assert token not in robot.users()
+        del queryable, declared
 
 
 def test_a_stop_with_any_content_goes_out(tmp_path: Path) -> None:

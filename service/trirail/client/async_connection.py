@@ -16,6 +16,7 @@ from trirail.client.stop_call import StopOrder
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.wire.messages import CommandReply, Event, RoleReply
 from trirail.wire.state import State
+from trirail.wire.text import is_name
 
 OTHER_LOOP = "the robot belongs to another event loop: enter a robot in this one, as async with AsyncRobot(…)"
 
@@ -87,7 +88,8 @@ class AsyncConnection:
         key = self._connection.key("here", "*")
         get = self._replies(lambda session: session.liveliness().get, key_expr=key, timeout=HERE_WITHIN)
         async with aclosing(get) as here:
-            return sorted({str(reply.ok.key_expr).rpartition("/")[2] async for reply in here if reply.ok is not None})
+            named = {str(reply.ok.key_expr).rpartition("/")[2] async for reply in here if reply.ok is not None}
+        return sorted(filter(is_name, named))  # any session may declare a token with any name
 
     async def stop(self, user: str, name: str, content: bytes | None, within: float) -> CommandReply:
         """Send a stop, quick_stop or disable both over Zenoh and to the stop port; return the first reply.
