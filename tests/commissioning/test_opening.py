@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from collections.abc import Callable
+
 import msgspec
 import pytest
-from commissioning.test_guide import Beside
+from commissioning.test_guide import ROBOT, Beside, odrives
 from control_rig import CONFIG
 from rigs import frame
 from trirail.commissioning import opening
+from trirail.config import Config
 from trirail_drivers.connection.opening import simulated_bus
+from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import SimulatedBus
 
 
@@ -31,3 +37,43 @@ def test_no_drive_is_set_up_beside_a_service(monkeypatch: pytest.MonkeyPatch) ->
         judgement, _ = steps.session.set_up()
     assert judgement.verdict == "failed"
     assert "another master is on the bus and sends PDOs" in judgement.words[0]
+
+
+def press_ctrl_c() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def interrupt() -> None:
+    """End the closing of a driver, in the way of a handler that nothing has replaced."""
+    raise KeyboardInterrupt("held down")
+
+
+@pytest.mark.parametrize("robot", [ROBOT, odrives()], ids=["cia402", "odrive"])
+@pytest.mark.parametrize("act", [press_ctrl_c, interrupt])
+def test_ctrl_c_held_down_leaves_no_drive_with_power(robot: Config, act: Callable[[], None]) -> None:
+    handler = signal.getsignal(signal.SIGINT)
+
+    def leave(person: Beside) -> None:
+        with opening.open_steps(robot, [], person, lambda: False, sleep=lambda _: None) as steps:
+            steps.session.set_up()
+            bench = steps.session.bench()
+            buses.append(steps.session.environment.bus)
+            with bench.power("A"):
+                bench.wait(0.1)
+                monitored, wait = bench._drives._wire, bench._drives._wire.wait  # type: ignore[attr-defined]
+
+                def waiting(*args: object) -> None:
+                    act()
+                    wait(*args)
+
+                bench._stop = interrupt  # type: ignore[method-assign]
+                monitored.wait = waiting
+                raise KeyboardInterrupt("first")
+
+    buses: list[object] = []
+    with pytest.raises(KeyboardInterrupt):
+        leave(Beside())
+    (bus,) = buses
+    assert isinstance(bus, SimulatedBus)
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert PowerState.OPERATION_ENABLED not in [drive.power for drive in bus.drives]

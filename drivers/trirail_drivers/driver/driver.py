@@ -167,18 +167,23 @@ class Driver(ABC, Generic[AnyAxis]):
     def close(self) -> None:
         """Remove power from the drives, and close the bus.
 
-        Drives that have power first stop with their quick-stop ramps.
+        Drives that have power first stop with their quick-stop ramps. An exception such as KeyboardInterrupt ends the
+        ramps, but not the removal of the power.
         """
         if self._closed:
             return
         self._closed = True
-        with contextlib.suppress(can.CanError, OSError):
-            if self._powered():
-                self.quick_stop()
-                self._wait_for_standstill(self._clock() + self._drives.stop_timeout)
-            self._make_outputs_safe()
-        self._cut_power()
-        self._wire.close()
+        try:
+            with contextlib.suppress(can.CanError, OSError):
+                if self._powered():
+                    self.quick_stop()
+                    self._wait_for_standstill(self._clock() + self._drives.stop_timeout)
+                self._make_outputs_safe()
+        finally:
+            try:
+                self._cut_power()
+            finally:
+                self._wire.close()
 
     @abstractmethod
     def sync(self) -> None:

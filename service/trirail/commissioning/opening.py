@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -47,6 +48,16 @@ class SimulatedClock:
         The closing of a driver waits for some time, while no cycle advances this clock.
         """
         self._free_since = time.monotonic()
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Ignore Ctrl-C, which would end the ramps of drives that are being closed. Closing takes a limited time."""
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 @contextmanager
@@ -97,4 +108,5 @@ def open_steps(
         finally:
             simulated.run_freely()
             if driver is not None:
-                driver.close()
+                with _without_interrupts():
+                    driver.close()
