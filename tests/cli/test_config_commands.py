@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commissioning.test_config_edit import disk_room
 from trirail.cli.app import app
 from trirail.config import SIM, load, parse
 from trirail.errors import ConfigError
@@ -73,6 +74,13 @@ def test_each_can_be_copied_to_a_file_or_into_a_folder_but_never_over_one(tmp_pa
     with pytest.raises(ConfigError, match=r"mine\.toml already exists: choose another file"):
         call(f"config copy sim {tmp_path / 'mine.toml'}")
     assert (tmp_path / "mine.toml").read_text() == "precious"
+
+
+@pytest.mark.parametrize("room", [0, 1000])
+def test_a_full_disk_leaves_no_part_of_a_copy(room: int, tmp_path: Path) -> None:
+    with disk_room(room), pytest.raises(ConfigError, match=r"sim\.toml: File too large"):
+        call(f"config copy sim {tmp_path}")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_copied_is_said(tmp_path: Path) -> None:

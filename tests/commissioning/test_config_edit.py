@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import operator
+import resource
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +73,26 @@ def test_no_file_is_written_over(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="already exists"):
         config_edit.write_new_file(first, "other")
     assert first.read_text() == "precious"
+
+
+@contextlib.contextmanager
+def disk_room(size: int) -> Iterator[None]:
+    """Let no file of this process grow beyond `size` bytes."""
+    handler, limits = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+@pytest.mark.parametrize("room", [0, 4096, 5000])
+def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, room: int) -> None:
+    path, text = tmp_path / "mine.toml", "a line of text\n" * 1000
+    with disk_room(room), pytest.raises(ConfigError, match=f"{path}: File too large"):
+        config_edit.write_new_file(path, text)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json as json_text
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from cyclopts import App
+from trirail_drivers import files
 
 from trirail.cli import terminal
 from trirail.cli.options import ConfigFile, Json
@@ -61,8 +61,7 @@ def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
     if target.is_dir():
         target /= source.name
     try:
-        with target.open("xb") as file, source.open("rb") as original:
-            shutil.copyfileobj(original, file)
+        files.create(target, source.read_bytes())
     except FileExistsError:
         raise ConfigError(f"{target} already exists: choose another file") from None
     except OSError as error:

@@ -8,6 +8,7 @@ from pathlib import Path
 import tomlkit
 from msgspec import structs
 from tomlkit.items import Table
+from trirail_drivers import files
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES, Triple
 
@@ -186,10 +187,9 @@ def check_new_file(path: Path) -> None:
 
 
 def write_new_file(path: Path, text: str) -> None:
-    """Write a new file. Raises ConfigError if the file exists or cannot be written."""
+    """Write a new file, completely or not at all. Raises ConfigError if the file exists or cannot be written."""
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
+        files.create(path, text.encode())
     except FileExistsError:
         raise ConfigError(f"{path} already exists; choose another file") from None
     except OSError as error:
