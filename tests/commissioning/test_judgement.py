@@ -228,6 +228,43 @@ def test_nodes_stay_different_where_only_some_were_looked_at(number: int, moves:
     assert sorted(nodes) == sorted(drive.node for drive in before.each)
 
 
+@given(
+    order=st.permutations(range(3)),
+    directions=st.tuples(*[st.sampled_from((1, -1))] * 3),
+    counts=st.tuples(*[st.sampled_from((1e6, 2e6, 5e6))] * 3),
+    pushed=st.sets(sliders, min_size=1),
+    slip=st.sampled_from((1.0, 0.8)),
+    resolution=st.sampled_from((1e-5, 2e-3)),
+)
+def test_direction_and_counts_follow_a_drive_to_its_slider(
+    order: list[int],
+    directions: tuple[int, ...],
+    counts: tuple[float, ...],
+    pushed: set[str],
+    slip: float,
+    resolution: float,
+) -> None:
+    """The slider with index s belongs to the drive with index order[s], for which the configuration is right."""
+    before = CONFIG.drives
+    for name, direction, each in zip(NAMES, directions, counts, strict=True):
+        drive = msgspec.structs.replace(getattr(before, name), direction=direction, counts_per_metre=each)
+        before = msgspec.structs.replace(before, **{name: drive})
+    proposals = []
+    for name in sorted(pushed):
+        drive = order[NAMES.index(name)]
+        out, back = (
+            (length * (drive == 0), length * (drive == 1), length * (drive == 2)) for length in (0.01, -0.01 * slip)
+        )
+        seen = PushObservation(name, 0.01, out, -0.01, back, resolution, 1e-7)
+        proposals.append(judge_push(seen, before).changes)
+    together, _ = merge_changes(proposals, before)
+    of = {drive.node: drive for drive in before.each}
+    for name, drive in zip(NAMES, before.each, strict=True):
+        belonging = of[int(together.get(f"drives.{name}.node", drive.node))]
+        for key in ("direction", "counts_per_metre"):
+            assert together.get(f"drives.{name}.{key}", getattr(drive, key)) == getattr(belonging, key)
+
+
 def test_two_drives_on_one_slider_are_no_exchange() -> None:
     before = drives()
     seen = [judge_move(moved(name, slider="C"), before).changes for name in ("A", "B")]
@@ -297,10 +334,10 @@ def test_node_ids_move_only_between_drives_of_one_make(
     nodes = [drive.node for drive in found.each]
     proposed = {f"drives.{name}.node": nodes[at] for name, at in zip(NAMES, moves, strict=True)}
     changes, conflict = merge_changes([proposed, {"drives.A.direction": -1}], found)
-    assert changes["drives.A.direction"] == -1
     if all(makes[at] == makes[moves[at]] for at in range(3)):
         assert conflict == ""
-    else:
-        assert set(changes) == {"drives.A.direction"}
+        assert changes["drives.A.direction"] == -1
+    else:  # the direction is that of the drive that A does not get
+        assert changes == ({"drives.A.direction": -1} if moves[0] == 0 else {})
         assert "is that of another make" in conflict
         assert "eds" in conflict

@@ -194,13 +194,15 @@ def _judge_coupling(
     rule_resolution, encoder_resolution = seen.rule_resolution, seen.encoder_resolution
     named = f"slider {label(slider, seen.labels)}"
     reasons = [*words]
+    # Direction and counts per metre follow the drive, also where the two strokes do not show them.
+    as_configured = {"node": drive.node, "direction": drive.direction, "counts_per_metre": drive.counts_per_metre}
     if slider != name:
         reasons.append(f"swapped nodes: drive {name}, node {drive.node}, has {named}")
     if min(abs(out.rule), abs(back.rule)) <= 2.0 * rule_resolution:
         reasons.append(f"the rule, read to {rule_resolution * 1e3:g} mm, shows neither direction nor scale")
         if slider == name:
             return Judgement("failed", tuple(reasons), "read it more finely, or push the slider further")
-        return _propose_changes(slider, configured, {"node": drive.node}, reasons)
+        return _propose_changes(slider, configured, as_configured, reasons)
     uncertainties = [2.0 * (rule_resolution + encoder_resolution) / abs(stroke.rule) for stroke in (out, back)]
     ratios = out.ratio, back.ratio
     if abs(ratios[0] - ratios[1]) > max(ratios) * max(tolerance, sum(uncertainties)):
@@ -209,7 +211,7 @@ def _judge_coupling(
             "slipping encoder or coupling: counts are lost on the way, or there is as much play",
         ]
         remedy = f"fasten encoder and coupling of drive {name} on their shafts, check for play, then repeat this step"
-        return Judgement("wrong", tuple(reasons), remedy, _node_change(slider, configured, drive))
+        return Judgement("wrong", tuple(reasons), remedy, _changes(slider, configured, as_configured))
     direction, counts = drive.direction, drive.counts_per_metre
     if out.counted * out.rule < 0.0:
         direction = -drive.direction
@@ -229,27 +231,27 @@ def _judge_coupling(
     elif slider == name and direction == drive.direction:
         accuracy = max(tolerance, uncertainty)
         reasons.append(f"direction is right, and counts per metre within the accuracy of {accuracy:.1%}")
-    values = {"node": drive.node, "direction": direction, "counts_per_metre": counts}
+    values = as_configured | {"direction": direction, "counts_per_metre": counts}
     return _propose_changes(slider, configured, values, reasons)
-
-
-def _node_change(slider: str, configured: Drive, drive: Drive) -> Changes:
-    return {} if drive.node == configured.node else {f"drives.{slider}.node": drive.node}
 
 
 def _propose_changes(
     slider: str, configured: Drive, values: Mapping[str, int | float], reasons: Sequence[str]
 ) -> Judgement:
     """Return a judgement that proposes those of the `values` that differ from the configured values."""
-    different = {key: value for key, value in values.items() if value != getattr(configured, key)}
-    if not different:
+    changes = _changes(slider, configured, values)
+    if not changes:
         return Judgement("ok", tuple(reasons))
     lines = (
-        f"drives.{slider}.{key} = {value:.10g}, not {getattr(configured, key):.10g}" for key, value in different.items()
+        f"{path} = {value:.10g}, not {getattr(configured, path.rpartition('.')[2]):.10g}"
+        for path, value in changes.items()
     )
     remedy = f"in the configuration {', '.join(lines)}; then start again with it"
-    changes = {f"drives.{slider}.{key}": value for key, value in different.items()}
     return Judgement("wrong", tuple(reasons), remedy, changes)
+
+
+def _changes(slider: str, configured: Drive, values: Mapping[str, int | float]) -> Changes:
+    return {f"drives.{slider}.{key}": value for key, value in values.items() if value != getattr(configured, key)}
 
 
 def _drive(drives: Drives, name: str) -> Drive:

@@ -25,42 +25,56 @@ from trirail.commissioning.steps import Steps
 from trirail.config import Config
 from trirail.errors import ConfigError
 
-KEYS_OF_THE_MAKE: Final = ("eds", "endpoints", "velocity_unit", "acceleration_unit", "accept_without", "write")
-"""Keys of a drive that follow the drive, not the slider, if two node ids are exchanged."""
+KEYS_OF_THE_MAKE: Final = (
+    "eds",
+    "endpoints",
+    "velocity_unit",
+    "acceleration_unit",
+    "revolutions_per_metre",
+    "accept_without",
+    "write",
+)
+"""Keys of a drive that follow the drive, not the slider, if two node ids are exchanged, and that nothing measures."""
+MEASURED_KEYS: Final = ("direction", "counts_per_metre")
+"""Keys of a drive that follow the drive as well, and that are measured for each slider."""
 
 
 def merge_changes(proposals: Sequence[Changes], drives: Drives) -> tuple[dict[str, int | float], str]:
     """Merge the changes that the steps propose; return them, and the reason why node ids cannot be changed, or "".
 
     If a node id moves to another slider, the slider that had this node id needs another one. The two node ids are
-    therefore exchanged, unless another step contradicts the exchange.
+    therefore exchanged, unless another step contradicts the exchange. A slider without a measurement of its own then
+    gets the direction and the counts per metre that are configured for its new drive.
     """
     changes = {key: value for each in proposals for key, value in each.items()}
     nodes = {name: drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
-    moved = {name: int(changes[f"drives.{name}.node"]) for name in NAMES if f"drives.{name}.node" in changes}
+    proposed = {name: int(changes.pop(f"drives.{name}.node", node)) for name, node in nodes.items()}
+    moved = {name: node for name, node in proposed.items() if node != nodes[name]}
     after = {**nodes, **moved}
     free = [node for node in nodes.values() if node not in after.values()]
     for name in NAMES:
         doubled = name not in moved and after[name] in moved.values()
-        if doubled and free:
+        has_measurement = any(key.startswith(f"drives.{name}.") for key in changes)
+        if doubled and free and not has_measurement:
             after[name] = free.pop(0)
+    # Measured with another drive, which a slider does not get without a change of its node id.
+    others = {key: value for key, value in changes.items() if key.split(".")[1] not in moved}
     if len(set(after.values())) < len(NAMES):
-        others = {key: value for key, value in changes.items() if not key.endswith(".node")}
-        return others, "two drives moved one slider; check the cables, and repeat those steps"
+        return others, "two drives moved one slider, or one drive moved two; check the cables, and repeat those steps"
     owners = {node: name for name, node in nodes.items()}
     of = dict(zip(NAMES, drives.each, strict=True))
     for name, node in after.items():
         owner = owners.get(node, name)
         if differing := [key for key in KEYS_OF_THE_MAKE if getattr(of[name], key) != getattr(of[owner], key)]:
-            others = {key: value for key, value in changes.items() if not key.endswith(".node")}
             return others, (
                 f"drives.{name}.node = {node} is that of another make: exchange the keys of drives.{name} and "
                 f"drives.{owner} by hand, also {', '.join(differing)}"
             )
-    for name, node in after.items():
-        changes.pop(f"drives.{name}.node", None)
         if node != nodes[name]:
             changes[f"drives.{name}.node"] = node
+        if node not in (nodes[name], moved.get(name)):
+            differing = [key for key in MEASURED_KEYS if getattr(of[name], key) != getattr(of[owner], key)]
+            changes |= {f"drives.{name}.{key}": getattr(of[owner], key) for key in differing}
     return dict(sorted(changes.items())), ""
 
 
