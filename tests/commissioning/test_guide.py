@@ -13,6 +13,7 @@ from pathlib import Path
 
 import can
 import msgspec
+import numpy as np
 import pytest
 from control_rig import CONFIG
 from trirail.commissioning import bench as benches
@@ -25,6 +26,7 @@ from trirail.commissioning.person import Question, QuitRequest
 from trirail.commissioning.report import CommissioningReport, ReportFile, StepReport
 from trirail.commissioning.steps import Steps
 from trirail.config import SIM, Config, load
+from trirail.kinematics.arrays import Array
 from trirail_drivers import config
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.interface import NAMES, PowerState
@@ -551,6 +553,41 @@ def test_the_report_is_in_its_files_after_every_step(tmp_path: Path, monkeypatch
     words = (tmp_path / "report.txt").read_text()
     assert "push C: wrong" in words
     assert "remedy: in the configuration drives.C.direction = -1" in words
+
+
+def test_the_platform_moves_only_after_the_person_has_taken_the_hands_off(resolution: str) -> None:
+    motions: list[tuple[str, float]] = []
+    placed = []
+
+    class Mover(Beside):
+        def show(self, line: str) -> None:
+            super().show(line)
+            if "Place the instrument" in line:
+                placed.append(len(motions))
+
+        def ask(self, question: Question, idle: Callable[[], object]) -> str:
+            now = np.array(rules.read())
+            if self.asked:
+                motions.append((self.asked[-1], float(np.abs(now - positions[-1]).max())))
+            positions.append(now)
+            return super().ask(question, idle)
+
+    person = Mover(answers={"To how many mm can you read the instrument": [resolution]})
+    with open_steps(ROBOT, [], person, lambda: False, sleep=lambda _: None) as steps:
+        steps.session.set_up()
+        rules = steps.session.environment.rules
+        assert rules is not None
+        positions: list[Array] = []
+        judgement, _ = steps.kind()
+        motions.append((person.asked[-1], float(np.abs(np.array(rules.read()) - positions[-1]).max())))
+    assert judgement.verdict == "ok"
+    moved = [(text, length) for text, length in motions if length > 2e-5]
+    assert len(moved) == 3
+    for text, length in motions:
+        announced = re.search(r"move by up to ([\d.]+) mm.*hands off", text)
+        assert length < 2e-5 if announced is None else length == pytest.approx(float(announced[1]) * 1e-3, abs=2e-4)
+    # Only the first motion is over, and the next question is not yet about the second one.
+    assert placed == [motions.index(moved[0])]
 
 
 def test_a_rule_that_is_read_coarsely_tells_no_scale_from_1_mm(tmp_path: Path) -> None:

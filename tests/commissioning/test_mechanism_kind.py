@@ -127,6 +127,15 @@ def test_no_way_is_larger_than_it_has_to_be(name: str, coarse: float) -> None:
     assert distances[0] < distances[1]
 
 
+@given(st.sampled_from(("uvw", "xxy", "uvw-ppr", "sim")), st.floats(1e-6, 1e-5))
+def test_the_separation_is_no_more_than_needed(name: str, read_to: float) -> None:
+    config = FILES[name]
+    robot = geometry(config.geometry)
+    found = find_test_move(config, robot, other_kind(robot), travels(robot, (0.0, 0.0, 0.0))[0], read_to)
+    assert found is not None
+    assert AMPLE_SEPARATION <= found[1].separation / read_to < 1.5 * AMPLE_SEPARATION
+
+
 def test_what_is_neither_kind_is_said() -> None:
     expected = MarkPrediction(0.0, 4e-4, 0.0)
     way = KindTestMove(np.zeros(3), np.zeros(3), 1, 0.05, 0, 0.01)

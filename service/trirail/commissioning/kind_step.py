@@ -63,9 +63,8 @@ class KindStep:
             return judge_kind(kinds, move, expected, None, resolution), _measured(expected, None, resolution)
         axis, line = AXES[move.axis], AXES[move.along]
         self._operator.show(
-            f"  The platform turns by {math.degrees(move.turn):+.2f}° and moves {move.distance * 1e3:+.2f} mm along "
-            f"{line}. Place the instrument at a mark, pin or ball on the platform, within {MARK_RADIUS_M * 1e3:g} mm "
-            f"of its centre, to read along {axis}, rising towards +{axis}. The edge of a turned table is no such mark."
+            f"  The platform turns by {math.degrees(move.turn):+.2f}°, moves {move.distance * 1e3:+.2f} mm along "
+            f"{line}, and returns."
         )
         rules, start = self._observer.read_rules(), np.array(bench.position)
 
@@ -76,11 +75,15 @@ class KindStep:
             return self._observer.ask_mark(axis, simulated)
 
         try:
-            self._move_to(move.first)
+            self._move_to(move.first, "Instrument away and hands off?")
+            self._operator.show(
+                f"  Place the instrument at a mark, pin or ball on the platform, within {MARK_RADIUS_M * 1e3:g} mm of "
+                f"its centre, to read along {axis}, rising towards +{axis}. The edge of a turned table is no such mark."
+            )
             first, before = np.array(bench.position), read_mark()
-            self._move_to(move.second)
+            self._move_to(move.second, f"Instrument free of {move.distance * 1e3:+.2f} mm along {line}, and hands off?")
             second, after = np.array(bench.position), read_mark()
-            self._move_to(start)
+            self._move_to(start, "Instrument away and hands off?")
         except DrivesStoppedError as error:
             return Judgement("failed", (str(error),), "repeat the steps of the slider that is named"), {}
         try:
@@ -90,13 +93,16 @@ class KindStep:
         moved = after - before
         return judge_kind(kinds, move, seen, moved, resolution), _measured(seen, moved, resolution)
 
-    def _move_to(self, target: Array) -> None:
-        """Move all three sliders to `target`, (3,) [m], with the drives enabled only during the motion.
+    def _move_to(self, target: Array, question: str) -> None:
+        """Ask the person, then move all three sliders to `target`, (3,) [m], with the drives enabled only meanwhile.
 
+        The sliders move by the distances that the question names, even if the person pushes them before the answer.
         Raises DrivesStoppedError.
         """
         bench = self._session.bench()
         distances = target - np.array(bench.position)
+        longest = float(np.abs(distances).max())
+        self._observer.ask_ready(f"Next the sliders move by up to {longest * 1e3:.2f} mm. {question}")
         with bench.power():
             bench.play(moves.plan_joint_move(distances, self._config.limits.slider, bench.period))
 

@@ -26,8 +26,10 @@ AMPLE_SEPARATION: Final = 24.0
 """Separation that is large enough to end the search for a motion, in multiples of the instrument's resolution."""
 MARK_RADIUS_M: Final = 0.005
 """Maximum distance of the mark from the platform's centre [m]."""
-SHARES: Final = tuple(np.linspace(0.05, 1.0, 20).tolist())
+SHARES: Final = tuple(np.geomspace(0.001, 1.0, 100).tolist())
 """Candidates for the size of the motion, as fractions of the way from the start to the platform's limits."""
+MIN_TURN_SHARE: Final = 0.05
+"""Minimum size of the turn, as SHARES. A smaller angle is comparable with unknown errors of the rails' angles."""
 LIMIT_SAMPLES: Final = 33
 """Number of points in each part of the motion at which the limits are checked."""
 AXES: Final = ("x", "y")
@@ -115,7 +117,7 @@ def _make_move(config: Config, robot: Geometry, sliders: Array, share: float, al
     for end in (platform.x, platform.y)[along]:
         pose = start.copy()
         pose[along] += share * (end - start[along])
-        pose[2] += share * (phi - start[2])
+        pose[2] += max(share, MIN_TURN_SHARE) * (phi - start[2])
         ends.append(pose)
     first, second = inverse(robot, np.array(ends)).position
     return KindTestMove(first, second, along, float(ends[0][2]), along, float(ends[1][along] - ends[0][along]))

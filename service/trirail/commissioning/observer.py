@@ -68,6 +68,11 @@ class Observer:
         question = Question(text, None if self._simulated is None else "0.001")
         return ask_length(self._operator, self._idle, question, 1e-8, 5e-3)
 
+    def ask_ready(self, text: str) -> None:
+        """Ask until the person confirms that a motion may start. Raises QuitRequest if the person quits."""
+        question = Question(f"{text} Enter starts the motion, q quits:", "y")
+        ask_choice(self._operator, self._idle, question, {"y": "start the motion"})
+
     def ask_mark(self, axis: str, simulated: float | None) -> float:
         """Ask for the reading of the instrument along `axis` [m]. `simulated` is the proposed answer, if any [m]."""
         default = None if simulated is None else f"{simulated * 1e3 + 0.0:.4f}"
