@@ -505,6 +505,127 @@ def test_a_drive_that_keeps_its_power_when_stopped_is_told_of(tmp_path: Path, mo
     assert "drive A STILL HAS POWER: press the emergency stop" in run.of("power", "A").words[0]
 
 
+class PowerObserver(Beside):
+    """Somebody who sees at every question which drives have power, and lets a drive keep its power from a step on."""
+
+    def __init__(self, since: str) -> None:
+        super().__init__()
+        self.keeps_power = False
+        self.endangered: list[str] = []
+        self.powered: Callable[[], list[object]] = list
+        self._since = since
+
+    def ask(self, question: Question, idle: Callable[[], object]) -> str:
+        idle()
+        text = question.text.strip()
+        self.keeps_power = self.keeps_power or (text.startswith("Run it?") and self._title == self._since)
+        is_choice = text.startswith(("Run it?", "Continue"))
+        if self.powered() and not is_choice:
+            self.endangered.append(f"{self._title}: {text}")
+        if self.powered() and is_choice and not any("STILL HAS POWER" in line for line in self.lines[-4:]):
+            self.endangered.append(f"not told: {self._title}: {text}")
+        return super().ask(question, idle)
+
+
+@pytest.mark.parametrize(
+    "since", ["Power on drive A alone", "Drive A moves 1 mm", "Watchdog of drive B", "3-PRP or 3-PPR"]
+)
+def test_nobody_is_asked_to_touch_a_robot_while_a_drive_keeps_its_power(
+    since: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person, change = PowerObserver(since), SimulatedDrive._change
+    kept = 2 if since.endswith("B") else 1
+
+    def deaf(self: SimulatedDrive, state: PowerState) -> None:
+        if not (person.keeps_power and self.node == kept and self.state is PowerState.OPERATION_ENABLED):
+            change(self, state)
+
+    monkeypatch.setattr(SimulatedDrive, "_change", deaf)
+    opened = opening.Steps
+
+    def observed(session: object) -> Steps:
+        steps = opened(session)  # type: ignore[arg-type]
+        drives = steps.session.environment.bus.drives  # type: ignore[attr-defined]
+        person.powered = lambda: [drive for drive in drives if drive.state is PowerState.OPERATION_ENABLED]
+        return steps
+
+    monkeypatch.setattr(opening, "Steps", observed)
+    run = Run(tmp_path, person=person)
+    assert person.endangered == []
+    entries = run.keeper.report.steps
+    told = f"drive {NAMES[kept - 1]} STILL HAS POWER: press the emergency stop"
+    after = entries[next(k for k, entry in enumerate(entries) if told in " ".join(entry.words)) :]
+    assert (after[0].step, after[0].verdict) == (
+        {"P": "power", "D": "move", "W": "watchdog", "3": "kind"}[since[0]],
+        "wrong" if since[0] == "W" else "failed",
+    )
+    assert {entry.verdict for entry in after[1:]} <= {"failed", "skipped"}
+    assert all(told in " ".join(entry.words) for entry in after)
+
+
+def test_ctrl_c_twice_names_the_drive_that_has_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second one comes while the drives stop."""
+    pressed, wait = [False], benches.Bench._wait_without_power
+
+    def interrupted(self: benches.Bench) -> None:
+        if pressed[0]:
+            raise KeyboardInterrupt
+        wait(self)
+
+    def press(self: benches.Bench, *rates: object) -> object:
+        pressed[0] = pressed[0] or self.max_errors[0] > 0.0
+        return turn(self, *rates)  # type: ignore[arg-type]
+
+    turn = benches.Bench.cycle
+    monkeypatch.setattr(benches.Bench, "cycle", press)
+    monkeypatch.setattr(benches.Bench, "_wait_without_power", interrupted)
+    monkeypatch.setattr(opening, "Bench", lambda *args: benches.Bench(*args[:3], lambda: pressed[0]))
+    person = Beside(only("A"))
+    with pytest.raises(KeyboardInterrupt):
+        Run(tmp_path, person=person)
+    told = json.loads((tmp_path / "report.json").read_text())["steps"][-1]
+    assert (told["step"], told["verdict"]) == ("move", "failed")
+    assert "drive A STILL HAS POWER: press the emergency stop" in told["words"]
+    assert person.lines[-1] == "drive A STILL HAS POWER: press the emergency stop"
+
+
+DRIVE_FAULTS = ("{} silent", "{} silent for 1.5", "{} drop tpdo2", "{} fault 4310", "{} emcy 3220", "{} reboot")
+
+
+@pytest.mark.generated(*range(12))
+def test_a_fault_of_a_drive_is_never_blamed_on_the_mechanics(seed: int) -> None:
+    """It comes before a step, or while a person answers one of its questions."""
+    chance = random.Random(seed)
+    step, name, number = ("push", "move", "switches")[seed % 3], chance.choice(NAMES), chance.choice((0, 0, 1, 2, 3, 4))
+    line = chance.choice(DRIVE_FAULTS).format(chance.choice(NAMES))
+
+    class Beginner(Beside):
+        def ask(self, question: Question, idle: Callable[[], object]) -> str:
+            answer = super().ask(question, idle)
+            if len(self.asked) == number:
+                begin(line)
+            return answer
+
+    def begin(line: str) -> None:
+        bus.faults.add(line)
+        bench.wait(0.3)
+
+    person = Beginner()
+
+    with open_steps(
+        ROBOT, [], person := Beginner(answers={"Are those all": ["n"]}), lambda: False, lambda _: None
+    ) as steps:
+        steps.session.set_up()
+        bench, bus = steps.session.bench(), steps.session.environment.bus
+        assert isinstance(bus, SimulatedBus)
+        if number == 0:
+            begin(line)
+        judgement, _ = getattr(steps, step)(name)
+    fault = bench.feedback.fault
+    assert judgement.verdict in (("ok",) if fault is None else ("failed",)), (line, person.asked, judgement)
+    assert fault is None or fault.message in judgement.words[0]
+
+
 def noted(name: str, do: Callable[[], None], told: list[str]) -> Callable[[], None]:
     """Return the same call, that notes its name."""
 

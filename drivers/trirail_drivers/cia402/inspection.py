@@ -10,11 +10,11 @@ import can
 from trirail_drivers.cia402 import canopen_frames, process_data, setup
 from trirail_drivers.cia402.one_drive import SetUp
 from trirail_drivers.cia402.other_masters import exclusive_bus
-from trirail_drivers.cia402.sdo import run_setups
+from trirail_drivers.cia402.sdo import SdoRefused, run_setups
 from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import scale_of
-from trirail_drivers.errors import BusError, DriveError
+from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES, Clock
 from trirail_drivers.timing import DEFAULT_TIMING, BusTiming
 
@@ -85,20 +85,21 @@ def _inspect(
 
 
 def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int | None]:
-    """Return a function that reads the digital inputs 60FDh of a named drive; it returns None if reading fails.
+    """Return a function that reads the digital inputs 60FDh of a named drive, or None if the drive refuses to be read.
 
-    The function waits for the answer and drops other frames. Use it only while the drives have no power, between two
-    cycles.
+    The function raises DriveError if the drive does not answer. It waits for the answer and drops other frames. Use it
+    only while the drives have no power, between two cycles.
     """
     remotes = {remote.name: remote for remote in setup.remotes(bus, drives, clock)}
 
     def read(name: str) -> int | None:
         remote = remotes[name]
-        try:
-            (value,) = run_setups(bus, clock, [remote], "reading", [remote.read(0x60FD)])
-        except BusError:
+        (value,) = run_setups(bus, clock, [remote], "reading", [remote.read(0x60FD)])
+        if isinstance(value, SdoRefused):
             return None
-        return None if isinstance(value, DriveError) else value
+        if isinstance(value, DriveError):
+            raise value
+        return value
 
     return read
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, NoReturn
 
 import numpy as np
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
@@ -43,7 +43,14 @@ _ZERO_VELOCITY: Final = (0.0, 0.0, 0.0)
 
 
 class DrivesStoppedError(Exception):
-    """Error raised after all drives were stopped and their power was switched off. The text contains the reason."""
+    """Error raised after all drives were stopped and their power was switched off.
+
+    The text contains the reason, and names the drives that have kept their power.
+    """
+
+
+class FollowingStopError(DrivesStoppedError):
+    """Error raised if only a following error stopped the drives, which have no fault and no power."""
 
 
 class MeasuredMotion(NamedTuple):
@@ -105,6 +112,20 @@ class Bench:
         """Measured slider positions [m]."""
         return self.feedback.position
 
+    @property
+    def power_warning(self) -> str:
+        """Warning that names the drives that have power, for when no drive may have power; "" if no drive has power."""
+        states, fault = self.feedback.state, self.feedback.fault
+        powered = {name for name, state in zip(NAMES, states, strict=True) if state in _POWERED_STATES}
+        if fault is not None and fault.cause == "timeout":
+            powered.add(fault.drive)
+        return f"drive {', '.join(sorted(powered))} STILL HAS POWER: press the emergency stop" if powered else ""
+
+    def check_without_power(self) -> None:
+        """Raise DrivesStoppedError if a drive has a fault, or has power."""
+        if problem := self._describe():
+            raise DrivesStoppedError(problem)
+
     def cycle(self, rates: Triple = _ZERO_VELOCITY) -> Feedback:
         """Run one cycle; send their target positions and the target velocities `rates` [m/s] to powered drives.
 
@@ -126,6 +147,8 @@ class Bench:
         self.missed_cycles += missed
         if reason := self._check(feedback, missed):
             self._stop_and_raise(reason)
+        if reason := self._check_following(feedback):
+            self._stop_and_raise(reason, FollowingStopError)
         for index, position in enumerate(feedback.position):
             # Until a drive follows setpoints, its measured position is its target, so that enabling causes no jump.
             if index not in self._powered or not feedback.follows[index]:
@@ -148,9 +171,10 @@ class Bench:
         Raises
         ------
         DrivesStoppedError
-            If a slider moves before power is applied, if a drive is not enabled within `watchdogs.enable_timeout`, or
-            if the drives report a fault.
+            If a slider moves before power is applied, if a drive is not enabled within `watchdogs.enable_timeout`, if
+            the drives report a fault, or if a drive has power before it is enabled or after it is disabled.
         """
+        self.max_errors = [0.0, 0.0, 0.0]
         self.clear_fault()
         before = self.feedback.position
         for name, was, now in zip(self._labels, before, self.wait(REST_CHECK_S).position, strict=True):
@@ -158,10 +182,10 @@ class Bench:
                 raise DrivesStoppedError(
                     f"slider {name}: moved {(now - was) * 1e3:.3f} mm without power; keep hands off and try again"
                 )
+        self.check_without_power()
         self._powered = tuple(range(len(NAMES))) if alone is None else (NAMES.index(alone),)
         self._target = list(self.feedback.position)
         self._setpoints.extend([self.feedback.position] * _HISTORY_CYCLES)
-        self.max_errors = [0.0, 0.0, 0.0]
         self._drives.enable(alone)
         try:
             for _ in range(round(self.config.watchdogs.enable_timeout / self.period)):
@@ -180,8 +204,16 @@ class Bench:
             return
         self._drives.disable()
         self._wait_without_power()
-        if (fault := self.feedback.fault) is not None:
-            raise DrivesStoppedError(fault.message)
+        self.check_without_power()
+
+    def prepare_hands_on(self) -> None:
+        """Reset a fault, and check that a person may touch the sliders.
+
+        Raises DrivesStoppedError if the fault persists, or if a drive has power.
+        """
+        self.clear_fault()
+        self.wait(REST_CHECK_S)
+        self.check_without_power()
 
     def play(self, move: SlowMove) -> MeasuredMotion:
         """Move the powered sliders from their targets along `move`, and wait until they have settled."""
@@ -238,8 +270,9 @@ class Bench:
             if not any(self.cycle().unready):
                 break
         self._drives.reset()
-        if (fault := self.wait(RESET_TIMEOUT_S).fault) is not None:
-            raise DrivesStoppedError(f"the fault cannot be reset: {fault.message}")
+        if self.wait(RESET_TIMEOUT_S).fault is not None:
+            problem = self._describe()
+            raise DrivesStoppedError(f"the fault cannot be reset: {problem}")
 
     def _has_power(self, feedback: Feedback) -> bool:
         return all(feedback.state[index] is PowerState.OPERATION_ENABLED for index in self._powered)
@@ -253,12 +286,14 @@ class Bench:
         if missed > self.config.watchdogs.max_overruns:
             return f"{missed} cycles missed in a row: the machine is too busy; see trirail doctor"
         for index, name in enumerate(NAMES):
-            state = feedback.state[index]
-            if index not in self._powered:
-                if state is PowerState.OPERATION_ENABLED:
-                    return f"drive {name}: enabled, although this step leaves it without power"
-                continue
-            if state is PowerState.OPERATION_ENABLED and feedback.follows[index]:
+            if index not in self._powered and feedback.state[index] is PowerState.OPERATION_ENABLED:
+                return f"drive {name}: enabled, although this step leaves it without power"
+        return ""
+
+    def _check_following(self, feedback: Feedback) -> str:
+        """Return the reason why the drives must be stopped if a powered slider does not follow its setpoints, or ""."""
+        for index in self._powered:
+            if feedback.state[index] is PowerState.OPERATION_ENABLED and feedback.follows[index]:
                 # Compare an old position with the setpoint that was in effect when the position was sampled.
                 sent = self._setpoints[-FEEDBACK_DELAY_CYCLES - min(feedback.age[index], 7)]
                 error = sent[index] - feedback.position[index]
@@ -269,14 +304,19 @@ class Bench:
                     return f"{slider}: following error {error * 1e3:.3f} mm exceeds the limit of {limit:g} mm"
         return ""
 
-    def _stop_and_raise(self, reason: str) -> None:
+    def _describe(self, reason: str = "") -> str:
+        """Return a reason, the fault of the drives, and the warning of drives with power, as one line."""
+        fault = self.feedback.fault
+        texts = reason, "" if fault is None else fault.message, self.power_warning
+        return "; ".join(dict.fromkeys(text for text in texts if text))
+
+    def _stop_and_raise(self, reason: str, error: type[DrivesStoppedError] = DrivesStoppedError) -> NoReturn:
+        """Stop all drives; raise `error`, or a plain DrivesStoppedError if a drive has a fault or still has power."""
         self._stop()
-        states = zip(NAMES, self.feedback.state, strict=True)
-        if powered := [name for name, state in states if state in _POWERED_STATES]:
-            reason += f"; drive {', '.join(powered)} STILL HAS POWER: press the emergency stop"
+        described = self._describe(reason)
         if self._interrupted():
-            raise KeyboardInterrupt(reason)
-        raise DrivesStoppedError(reason)
+            raise KeyboardInterrupt(described)
+        raise (error if described == reason else DrivesStoppedError)(described)
 
     def _stop(self) -> None:
         self._drives.quick_stop()

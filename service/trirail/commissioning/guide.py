@@ -121,7 +121,7 @@ def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
             "push",
             name,
             f"Slider {steps.slider_label(name)} by hand",
-            f"You push slider {steps.slider_label(name)}; no drive has power. Skip it (s) if it cannot be pushed.",
+            f"You push slider {steps.slider_label(name)}, without power. Skip it (s) if it cannot be pushed.",
             partial(steps.push, name),
             (("setup", ""),),
         )
@@ -157,8 +157,8 @@ def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
             "switches",
             name,
             f"Switches of slider {steps.slider_label(name)}",
-            f"You press each limit switch and the home switch of slider {steps.slider_label(name)} by hand; "
-            "no drive has power.",
+            f"You press each limit switch and the home switch of slider {steps.slider_label(name)} by hand, "
+            "without power.",
             partial(steps.switches, name),
             (("setup", ""),),
         )
@@ -244,6 +244,8 @@ class Guide:
                 self._record(step, Judgement("skipped", (reason,)))
                 at += 1
                 continue
+            if warning := self._steps.session.power_warning:
+                self._operator.show(f"  {warning}")
             self._operator.show(f"  {step.description}")
             if step.name == "setup":
                 for line in self._steps.session.describe_setup():
@@ -317,6 +319,7 @@ class Guide:
     def _record(
         self, step: GuideStep, judgement: Judgement, measured: dict[str, float | int | str | bool | None] | None = None
     ) -> None:
+        judgement = self._steps.session.warn_of_power(judgement)
         self._report_file.add(step.name, step.drive, judgement, measured or {})
         self._operator.show_judgement(judgement)
 

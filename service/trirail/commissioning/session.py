@@ -100,7 +100,7 @@ class Session:
         try:
             self._bench = self.environment.make_bench()
         except DriveError as error:
-            return Judgement("failed", (str(error),), "follow the line above; no drive has power"), {}
+            return Judgement("failed", (str(error),), "follow the line above"), {}
         self._bench.wait(SETUP_CHECK_S)
         if (fault := self._bench.feedback.fault) is not None:
             try:
@@ -128,6 +128,19 @@ class Session:
         if self._bench is None:
             raise RuntimeError("the drives are not set up")
         return self._bench
+
+    def warn_of_power(self, judgement: Judgement) -> Judgement:
+        """Return the judgement of a step that has ended, with a warning and not as ok if a drive still has power."""
+        warning = self.power_warning
+        if not warning or any(warning in word for word in judgement.words):
+            return judgement
+        verdict = "failed" if judgement.verdict == "ok" else judgement.verdict
+        return judgement._replace(verdict=verdict, words=(*judgement.words, warning))
+
+    @property
+    def power_warning(self) -> str:
+        """Warning that names the drives that have power between two steps; "" if no drive has power."""
+        return "" if self._bench is None else self._bench.power_warning
 
     def idle(self) -> None:
         """Run one cycle of the drives, or wait for a short time if the drives have not been set up.

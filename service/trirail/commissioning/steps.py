@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import wraps
+from typing import Concatenate, NamedTuple, ParamSpec
 
 import numpy as np
+from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
 
 from trirail import naming
 from trirail.commissioning import moves
-from trirail.commissioning.bench import DrivesStoppedError
+from trirail.commissioning.bench import DrivesStoppedError, FollowingStopError
 from trirail.commissioning.coupling import MoveObservation, PushObservation, judge_move, judge_push
 from trirail.commissioning.judgement import (
     SWITCHES,
@@ -29,12 +32,36 @@ from trirail.config import geometry
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward
 
+Arguments = ParamSpec("Arguments")
+
 HOLD_TIME_S = 1.0
 """Time for which a drive holds its slider when it is enabled for the first time [s]."""
 PUSH_DISTANCE_M = 0.010
 """Recommended travel of a slider that is pushed by hand [m]."""
 INPUT_POLL_S = 0.05
 """Interval at which digital inputs are read while switches are pressed [s]."""
+
+
+def _hands_on(
+    step: Callable[Concatenate[Steps, Arguments], StepOutcome],
+) -> Callable[Concatenate[Steps, Arguments], StepOutcome]:
+    """Decorate a step in which a person touches the robot. No drive may have power or a fault before and after it.
+
+    Otherwise the step ends as failed, so that the fault of a drive is not blamed on the mechanics.
+    """
+
+    @wraps(step)
+    def run(self: Steps, /, *args: Arguments.args, **keys: Arguments.kwargs) -> StepOutcome:
+        bench = self.session.bench()
+        try:
+            bench.prepare_hands_on()
+            outcome = step(self, *args, **keys)
+            bench.check_without_power()
+        except (DrivesStoppedError, DriveError) as error:
+            return Judgement("failed", (str(error),), "remove the cause, then repeat this step"), {}
+        return outcome
+
+    return run
 
 
 class Steps:
@@ -54,6 +81,7 @@ class Steps:
 
     # Without power.
 
+    @_hands_on
     def push(self, name: str) -> StepOutcome:
         """Ask the person to push a slider out and back by hand, without power."""
         bench, index = self.session.bench(), NAMES.index(name)
@@ -93,6 +121,7 @@ class Steps:
             self._operator.show(f"  Simulated push of slider {self._labels[index]}: {by * 1e3:+g} mm.")
         return self._observer.ask_rule(index), bench.position
 
+    @_hands_on
     def switches(self, name: str) -> StepOutcome:
         """Ask the person to press the switches of a slider by hand, without power."""
         bench, read = self.session.bench(), self._environment.inputs
@@ -140,6 +169,7 @@ class Steps:
         drift = bench.max_errors[NAMES.index(name)]
         return judge_power(name, drift, HOLD_TIME_S, stopped), {"drift": drift}
 
+    @_hands_on
     def move(self, name: str) -> StepOutcome:
         """Move a single enabled drive out and back. The person reports which slider moved, and how far."""
         index, drives = NAMES.index(name), self._config.drives
@@ -251,18 +281,22 @@ class Steps:
         judgement = judge_square(deviation, bench.max_errors, confirmed, stopped, self._labels)
         return judgement, {"deviation": deviation, "missed_cycles": bench.missed_cycles, **following}
 
+    @_hands_on
     def kind(self) -> StepOutcome:
         """Check the kind of the mechanism with the measured travel of a mark on the platform."""
         return KindStep(self.session, self._observer).run()
 
     def _move_slider(self, index: int, distance: float) -> _SliderMotion:
-        """Move one slider over `distance` [m]. Only the drive of this slider is enabled, and only during the motion."""
+        """Move one slider over `distance` [m]. Only the drive of this slider is enabled, and only during the motion.
+
+        Raises DrivesStoppedError if another problem than a following error stops it.
+        """
         bench, stopped = self.session.bench(), ""
         before = bench.position[index]
         try:
             with bench.power(NAMES[index]):
                 bench.play(moves.plan_slider_move(index, distance, self._config.limits.slider, self._config.period))
-        except DrivesStoppedError as error:
+        except FollowingStopError as error:
             stopped = str(error)
         bench.wait(HOLD_TIME_S / 10.0)
         return _SliderMotion(bench.position[index] - before, bench.max_errors[index], stopped)
