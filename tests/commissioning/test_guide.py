@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import itertools
 import json
 import random
@@ -24,11 +25,14 @@ from trirail.commissioning.observer import Observer
 from trirail.commissioning.opening import open_steps
 from trirail.commissioning.person import Question, QuitRequest
 from trirail.commissioning.report import CommissioningReport, ReportFile, StepReport
+from trirail.commissioning.session import Session
 from trirail.commissioning.steps import Steps
 from trirail.config import SIM, Config, load
 from trirail.kinematics.arrays import Array
-from trirail_drivers import config
+from trirail_drivers import config, files
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.eds import SERVO
+from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.protocols import CIA402
 from trirail_drivers.simulated import SimulatedBus, SimulatedDrive
@@ -541,10 +545,9 @@ def test_nobody_is_asked_to_touch_a_robot_while_a_drive_keeps_its_power(
             change(self, state)
 
     monkeypatch.setattr(SimulatedDrive, "_change", deaf)
-    opened = opening.Steps
 
-    def observed(session: object) -> Steps:
-        steps = opened(session)  # type: ignore[arg-type]
+    def observed(session: Session) -> Steps:
+        steps = Steps(session)
         drives = steps.session.environment.bus.drives  # type: ignore[attr-defined]
         person.powered = lambda: [drive for drive in drives if drive.state is PowerState.OPERATION_ENABLED]
         return steps
@@ -579,7 +582,7 @@ def test_ctrl_c_twice_names_the_drive_that_has_power(tmp_path: Path, monkeypatch
     turn = benches.Bench.cycle
     monkeypatch.setattr(benches.Bench, "cycle", press)
     monkeypatch.setattr(benches.Bench, "_wait_without_power", interrupted)
-    monkeypatch.setattr(opening, "Bench", lambda *args: benches.Bench(*args[:3], lambda: pressed[0]))
+    monkeypatch.setattr(opening, "Bench", lambda a, b, tick, _: benches.Bench(a, b, tick, lambda: pressed[0]))
     person = Beside(only("A"))
     with pytest.raises(KeyboardInterrupt):
         Run(tmp_path, person=person)
@@ -607,7 +610,7 @@ def test_a_fault_of_a_drive_is_never_blamed_on_the_mechanics(seed: int) -> None:
             return answer
 
     def begin(line: str) -> None:
-        bus.faults.add(line)
+        faults.add(line)
         bench.wait(0.3)
 
     person = Beginner()
@@ -618,6 +621,7 @@ def test_a_fault_of_a_drive_is_never_blamed_on_the_mechanics(seed: int) -> None:
         steps.session.set_up()
         bench, bus = steps.session.bench(), steps.session.environment.bus
         assert isinstance(bus, SimulatedBus)
+        faults = bus.faults
         if number == 0:
             begin(line)
         judgement, _ = getattr(steps, step)(name)
@@ -659,14 +663,20 @@ def test_ctrl_c_stops_in_that_cycle_and_ends_without_power(monkeypatch: pytest.M
 
 def test_the_report_is_in_its_files_after_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     person = Beside()
-    seen = person.show_judgement
+    seen, ask, shown = person.show_judgement, person.ask, list[Judgement]()
 
-    def look(judgement: Judgement) -> None:
-        told = json.loads((tmp_path / "report.json").read_text())
-        assert told["steps"][-1]["words"] == list(judgement.words)
+    def show(judgement: Judgement) -> None:
+        shown.append(judgement)
         seen(judgement)
 
-    monkeypatch.setattr(person, "show_judgement", look)
+    def look(question: Question, idle: Callable[[], object]) -> str:
+        if shown:
+            told = json.loads((tmp_path / "report.json").read_text())
+            assert [entry["words"] for entry in told["steps"]] == [list(judgement.words) for judgement in shown]
+        return ask(question, idle)
+
+    monkeypatch.setattr(person, "show_judgement", show)
+    monkeypatch.setattr(person, "ask", look)
     run = Run(tmp_path, faults=["C reversed"], person=person)
     told = json.loads((tmp_path / "report.json").read_text())
     assert told["changes"] == {"drives.C.direction": -1}
@@ -676,6 +686,64 @@ def test_the_report_is_in_its_files_after_every_step(tmp_path: Path, monkeypatch
     assert "remedy: in the configuration drives.C.direction = -1" in words
 
 
+@pytest.mark.generated(0, 1, 2)
+def test_a_report_that_cannot_be_saved_hides_no_judgement(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chance, replace, failed, person = random.Random(seed), files.replace, list[Path](), Beside(["by hand", "Power"])
+
+    def full(path: Path, content: bytes, mode: int = 0o644) -> None:
+        if "No corrected values" not in " ".join(person.lines) and chance.random() < 0.5:
+            failed.append(path)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(path, content, mode)
+
+    monkeypatch.setattr(files, "replace", full)
+    run = Run(tmp_path, person=person)
+    warnings = [line for line in person.lines if line.startswith("  The report is not saved")]
+    assert len(warnings) == len(failed) > 0
+    assert all("No space left on device" in line for line in warnings)
+    told = json.loads((tmp_path / "report.json").read_text())["steps"]
+    assert len(told) == len(run.keeper.report.plan)
+    assert all(set(entry["words"]) <= set(person.lines) for entry in told)
+
+
+def allow_one_setup(monkeypatch: pytest.MonkeyPatch) -> None:
+    configure, configured = Cia402.configure, list[Cia402]()
+
+    def configure_once(self: Cia402, *args: float) -> None:
+        if configured:
+            raise DriveError("drive C: does not answer")
+        configured.append(self)
+        configure(self, *args)
+
+    monkeypatch.setattr(Cia402, "configure", configure_once)
+
+
+def test_a_failed_repeat_keeps_what_later_steps_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The set-up fails when it is repeated after a push: no later step runs again, and its correction is written."""
+    person = Beside(answers={"Run it?": ["y", "y", "y", "b", "b", "y"]})
+    allow_one_setup(monkeypatch)
+    run = Run(tmp_path, faults=["A reversed"], person=person)
+    assert run.of("setup").verdict == "failed"
+    assert (run.of("push", "A").verdict, run.of("push", "B").verdict) == ("wrong", "skipped")
+    assert run.keeper.report.changes == {"drives.A.direction": -1}
+    assert run.written is not None
+
+
+def test_no_step_runs_after_one_that_it_needs_has_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a failed repeat of the set-up, an earlier result of a step between does not let a later one run."""
+    skipped = ["s"] * 3
+    person = Beside(answers={"Run it?": ["y", "y", *skipped, "y", "b", "b", "b", "b", "b", "y"]})
+    allow_one_setup(monkeypatch)
+    run = Run(tmp_path, person=person)
+    assert (run.of("setup").verdict, run.of("power", "A").verdict) == ("failed", "ok")
+    assert run.of("move", "A").words == ("requires setup to be ok",)
+    assert not any("needs no correction" in line for line in person.lines)
+    assert "setup" in person.lines[-1]
+
+
+@pytest.mark.parametrize("resolution", ["0.0005", "0.002", "0.02"])
 def test_the_platform_moves_only_after_the_person_has_taken_the_hands_off(resolution: str) -> None:
     motions: list[tuple[str, float]] = []
     placed = []
@@ -687,7 +755,7 @@ def test_the_platform_moves_only_after_the_person_has_taken_the_hands_off(resolu
                 placed.append(len(motions))
 
         def ask(self, question: Question, idle: Callable[[], object]) -> str:
-            now = np.array(rules.read())
+            now = np.array(read())
             if self.asked:
                 motions.append((self.asked[-1], float(np.abs(now - positions[-1]).max())))
             positions.append(now)
@@ -698,9 +766,9 @@ def test_the_platform_moves_only_after_the_person_has_taken_the_hands_off(resolu
         steps.session.set_up()
         rules = steps.session.environment.rules
         assert rules is not None
-        positions: list[Array] = []
+        read, positions = rules.read, list[Array]()
         judgement, _ = steps.kind()
-        motions.append((person.asked[-1], float(np.abs(np.array(rules.read()) - positions[-1]).max())))
+        motions.append((person.asked[-1], float(np.abs(np.array(read()) - positions[-1]).max())))
     assert judgement.verdict == "ok"
     moved = [(text, length) for text, length in motions if length > 2e-5]
     assert len(moved) == 3

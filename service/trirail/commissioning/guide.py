@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 from trirail_drivers import files
 from trirail_drivers.config import Drives
+from trirail_drivers.errors import FileError
 from trirail_drivers.interface import NAMES
 
 from trirail import naming
@@ -226,10 +227,11 @@ class Guide:
         self._steps = steps
         self._operator = operator
         self._report_file = report_file
+        self._plan = plan_steps(steps, config)
 
     def run(self) -> None:
         """Run all steps. Raises QuitRequest if the person quits."""
-        plan = plan_steps(self._steps, self._config)
+        plan = self._plan
         self._report_file.report.plan = tuple((step.name, step.drive) for step in plan)
         if self._report_file.report.simulated:
             self._operator.show(
@@ -241,7 +243,7 @@ class Guide:
             self._operator.show("")
             self._operator.show(f"{at + 1}/{len(plan)}  {step.title}")
             if reason := self._missing(step):
-                self._record(step, Judgement("skipped", (reason,)))
+                self._skip(step, reason)
                 at += 1
                 continue
             if warning := self._steps.session.power_warning:
@@ -279,8 +281,11 @@ class Guide:
                 )
             except ConfigError as error:
                 self._operator.show(f"not written: {error}")
-        else:
+        elif self._report_file.report.complete:
             self._operator.show("The configuration needs no correction.")
+        else:
+            missing = ", ".join(self._report_file.report.incomplete)
+            self._operator.show(f"No corrected values; steps that have not passed: {missing}.")
         self._report_file.conclude(changes, written)
         return written
 
@@ -298,8 +303,8 @@ class Guide:
         """Ask the person to run a step, skip it or return to the previous step; return False for the previous step."""
         choices = {"y": "run it", "s": "skip it", "b": "previous step"}
         choice = self._ask("  Run it? Enter or y, s skip, b back, q quit:", "y", choices)
-        if choice == "s" and (step.name, step.drive) not in self._report_file.report.latest:
-            self._record(step, Judgement("skipped", ("left out",)))
+        if choice == "s":
+            self._skip(step, "left out")
         while choice == "y":
             try:
                 judgement, measured = step.run()
@@ -320,10 +325,22 @@ class Guide:
         self, step: GuideStep, judgement: Judgement, measured: dict[str, float | int | str | bool | None] | None = None
     ) -> None:
         judgement = self._steps.session.warn_of_power(judgement)
-        self._report_file.add(step.name, step.drive, judgement, measured or {})
         self._operator.show_judgement(judgement)
+        try:
+            self._report_file.add(step.name, step.drive, judgement, measured or {})
+        except FileError as error:
+            self._operator.show(f"  The report is not saved: {error}")
+
+    def _skip(self, step: GuideStep, reason: str) -> None:
+        """Record that a step is skipped, unless it was run before: the result of its last run still counts."""
+        entry = self._report_file.report.latest.get((step.name, step.drive))
+        if entry is None or entry.verdict == "skipped":
+            self._record(step, Judgement("skipped", (reason,)))
+        else:
+            self._operator.show(f"  {reason}; its last result still counts: {entry.verdict}")
 
     def _missing(self, step: GuideStep) -> str:
+        """Return the reason why a step, or one that it needs, cannot be run; "" if the step can be run."""
         latest = self._report_file.report.latest
         missing = [
             f"{name} {drive}".rstrip()
@@ -337,4 +354,7 @@ class Guide:
             for name, drive in step.not_after
             if (name, drive) in latest and latest[name, drive].verdict == "wrong"
         ]
-        return f"not run after the defect that {', '.join(wrong)} found" if wrong else ""
+        if wrong:
+            return f"not run after the defect that {', '.join(wrong)} found"
+        reasons = (self._missing(each) for each in self._plan if (each.name, each.drive) in step.needs)
+        return next(filter(None, reasons), "")
