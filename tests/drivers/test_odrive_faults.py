@@ -24,6 +24,7 @@ from drivers.test_faults import (
     tried,
 )
 from drivers.test_odrive import odrives
+from rigs import frame
 from trirail.config import Config
 from trirail.wire.packets import CommandDone, Refused, Request
 from trirail.wire.vocabulary import Mode
@@ -239,6 +240,25 @@ def elsewhere(rig: OdriveRig) -> None:
     rig.spoilt[cansimple.identifier(2, cansimple.GET_ENCODER_ESTIMATES)] = farther
 
 
+def second_node(rig: OdriveRig, apart: float) -> None:
+    """Another drive has the node id of drive A, and a slider that is `apart` metres beside A's."""
+    identifier = cansimple.identifier(0, cansimple.GET_ENCODER_ESTIMATES)
+    receive = rig.bus.recv
+    waiting: list[can.Message] = []
+
+    def recv(timeout: float | None = None) -> can.Message | None:
+        if waiting:
+            return waiting.pop()
+        message = receive(timeout)
+        if message is not None and message.arbitration_id == identifier:
+            turns, velocity = cansimple.ESTIMATES.unpack(message.data)
+            waiting.append(frame(identifier, cansimple.ESTIMATES.pack(turns + apart * TURNS, velocity)))
+        return message
+
+    rig.bus.recv = recv  # type: ignore[method-assign]
+    rig.undo.append(lambda: setattr(rig.bus, "recv", receive))
+
+
 def short_watchdog(rig: OdriveRig) -> None:
     """The watchdog of drive B is shorter than a cycle."""
     drive = rig.odrives[1]
@@ -256,11 +276,14 @@ BY_HAND: dict[str, Callable[[OdriveRig], None]] = {
     "C no number": no_number,
     "C elsewhere": elsewhere,
     "B short watchdog": short_watchdog,
+    "second A 50 mm beside": partial(second_node, apart=0.05),
+    "second A 1 mm beside": partial(second_node, apart=0.001),
 }
 """What fault lines have no words for."""
 
 SILENT = r"drive {}: no position for 3 cycles in a row"
 FOLLOWING = r"(slider|drive) {}: following error"
+SECOND = r"drive A: a second node with id 0 on the bus: each request has two positions"
 STOP = [
     # frames that do not come, come late or come wrong
     Case("A drop get_encoder_estimates", 3, SILENT.format("A")),
@@ -303,6 +326,8 @@ STOP = [
         lasts=False,
     ),
     Case("B reboot for 0.1", 3, SILENT.format("B"), stands=ROLLING, lasts=False),
+    Case("second A 50 mm beside", 3, rf"{SECOND}|{FOLLOWING.format('A')}"),
+    Case("second A 1 mm beside", 40, SECOND),
     # the bus
     Case("bus-off", 1, r"CAN bus .* is down: bus-off", stands=DEAF),
     Case("nobody acknowledges", 3, r"CAN bus: cannot send: .*the transmit queue is full", stands=DEAF),

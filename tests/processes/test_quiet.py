@@ -60,6 +60,7 @@ from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import NAMES
+from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus
 
@@ -563,17 +564,25 @@ def test_what_the_last_gate_refuses_is_a_fault_in_the_same_cycle(protocol: str, 
     assert "time along the path would run backwards" in (one.loop.control.fault or "")
 
 
-def test_a_position_that_comes_twice_now_and_then_is_no_second_nodes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("protocol", CONFIGS)
+@pytest.mark.parametrize(("often", "found"), [(37, None), (1, "a second node with id 1 on the bus")])
+def test_a_position_that_comes_twice_is_a_second_nodes_only_if_it_does_so_often(
+    protocol: str, often: int, found: str | None, tmp_path: Path
+) -> None:
     """They are counted over twenty SYNCs, whoever runs the cycles."""
 
     def say_once_more(session: Session) -> None:
-        assert isinstance(session.driver, Cia402)
-        (actual,) = (axis.actual for axis in session.driver._axes if axis.node == 1)
-        session.inject(CAN_FRAME.pack(0x281, 4, struct.pack("<i", actual + 1)))
+        assert isinstance(session.driver, Cia402 | Odrive)
+        newest = next(axis.newest for axis in session.driver._axes if axis.node == 1)
+        if protocol == "cia402":
+            session.inject(CAN_FRAME.pack(0x281, 4, struct.pack("<i", round(newest) + 1)))
+        else:
+            session.inject(CAN_FRAME.pack(0x029, 8, struct.pack("<ff", newest + 1e-3, 0.0)))
 
-    happens = {number: [Happening(say_once_more)] for number in range(100, 900, 37)}
-    one = both_ways(CONFIG, tmp_path, lambda: happens, 900)
-    assert one.loop.control.fault is None
+    happens = {number: [Happening(say_once_more)] for number in range(100, 900, often)}
+    one = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 900)
+    fault = one.loop.control.fault
+    assert fault is None if found is None else found in (fault or "")
 
 
 LOSSES = (

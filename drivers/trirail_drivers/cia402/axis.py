@@ -7,13 +7,14 @@ from typing import Any
 
 from trirail_drivers.cia402 import canopen_frames, process_data
 from trirail_drivers.cia402.codes import describe_error
-from trirail_drivers.cia402.duplicate_node import AnswersAfterStop, AnswersPerSync, warning
+from trirail_drivers.cia402.duplicate_node import AnswersAfterStop
 from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import DigitalIo, Drives
 from trirail_drivers.driver.axis import SILENT_AFTER, Axis
 from trirail_drivers.driver.axis_row import NOTHING_SENT
 from trirail_drivers.driver.cyclic import expected_row
+from trirail_drivers.driver.duplicate_node import AnswersPerSync, warning
 from trirail_drivers.driver.row_updates import accept_counts, accept_statusword
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState

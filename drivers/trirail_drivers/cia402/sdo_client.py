@@ -11,9 +11,10 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.frames import Frame, FrameSender
-from trirail_drivers.cia402 import canopen_frames, duplicate_node
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.objects import Key
 from trirail_drivers.driver.conversations import Wait
+from trirail_drivers.driver.duplicate_node import warning
 from trirail_drivers.interface import Clock
 
 MAX_SECOND_ANSWERS: Final = 10
@@ -41,7 +42,7 @@ class TwoNodesError(SdoCommunicationError):
     """Requests have received two answers, so two nodes have the same id."""
 
     def __init__(self, node: int) -> None:
-        super().__init__(duplicate_node.warning(node, "both answer"))
+        super().__init__(warning(node, "both answer"))
 
 
 class NoAnswerError(SdoCommunicationError):

@@ -43,10 +43,10 @@ class AxisRow(ctypes.Structure):
     """Whether the last position arrived before the frames of its SYNC's cycle were read."""
     came: bool
     """Whether a position has arrived in this cycle."""
-    newest: int
-    """Position received last [counts]."""
-    step: int
-    """Last non-zero difference between consecutive positions [counts]."""
+    newest: float
+    """Position received last, in drive units."""
+    step: float
+    """Last non-zero difference between consecutive positions, in drive units."""
     stands_at: int
     """Position at which the slider is at rest [counts]."""
     stands_since: float
@@ -98,7 +98,7 @@ class AxisRow(ctypes.Structure):
     still: float
     """Largest movement at which the slider still counts as at rest [counts]."""
     far_apart: float
-    """Difference between two positions after one SYNC above which they come from two sliders [counts]."""
+    """Difference between two positions after one SYNC above which they come from two sliders, in drive units."""
     heard_within: float
     """Largest age of `heard` [s]."""
     status_within: float

@@ -52,14 +52,16 @@ def accept_answer(row: AxisRow, sampled: int) -> None:
     row.sampled = sampled
 
 
-def turns_back(row: AxisRow, counts: int) -> bool:
-    """Whether a received position [counts] lies in the opposite direction to the last step."""
-    return (counts < row.newest and row.step > 0) or (counts > row.newest and row.step < 0)
+def turns_back(row: AxisRow, place: float) -> bool:
+    """Whether a received position in drive units lies in the opposite direction to the last step."""
+    return (place < row.newest and row.step > 0) or (place > row.newest and row.step < 0)
 
 
-def is_far(row: AxisRow, counts: int) -> bool:
-    """Whether a received position [counts] and the one before it must come from two sliders, if no SYNC is between."""
-    return abs(counts - row.newest) > row.far_apart
+def is_far(row: AxisRow, place: float) -> bool:
+    """Whether a received position in drive units and the one before it must come from two sliders, if no SYNC is
+    between.
+    """
+    return abs(place - row.newest) > row.far_apart
 
 
 def accept_counts(row: AxisRow, counts: int, now: float) -> None:
@@ -75,6 +77,9 @@ def accept_counts(row: AxisRow, counts: int, now: float) -> None:
 
 def accept_turns(row: AxisRow, turns: float) -> None:
     """Store a received position [turns]."""
+    if turns != row.newest:
+        row.step = turns - row.newest
+    row.newest = turns
     row.position = turns / row.counts_per_metre + row.zero
 
 

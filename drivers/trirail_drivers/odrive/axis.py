@@ -9,6 +9,7 @@ from trirail_drivers.bus.wire import Handler
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.cyclic import expected_row
+from trirail_drivers.driver.duplicate_node import AnswersPerSync, warning
 from trirail_drivers.driver.row_updates import accept_turns
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
@@ -52,6 +53,7 @@ class OdriveAxis(Axis):
         self._started = False
         """Whether a heartbeat has shown that the drive is no longer booting."""
         self._result: int = ProcedureResult.SUCCESS
+        self._answers_per_request = AnswersPerSync(self)
 
     def is_steady(self, wanted: AxisState | None) -> bool:
         """Whether the drive needs no command and no decision as long as its frames do not change."""
@@ -59,7 +61,7 @@ class OdriveAxis(Axis):
         well = self.reported and not self.errors and self.event is None and self.reset_until == -math.inf
         follows = self.powered_up or wanted is AxisState.IDLE
         answers = self.configured and self.missed < self.missed_limit and math.isfinite(self.position)
-        return in_state and well and follows and answers
+        return in_state and well and follows and answers and self._answers_per_request.is_clear
 
     @property
     def heartbeat_state(self) -> tuple[int, int]:
@@ -116,11 +118,17 @@ class OdriveAxis(Axis):
         turns, _ = cansimple.ESTIMATES.unpack(data)
         if not self.configured:  # a drive that is booting does not know its position yet
             return
-        self.answer()
         if math.isfinite(turns):
+            self._answers_per_request.add_position(turns)
             accept_turns(self, turns)
         else:
             self.note_fault("frame", 0, f"position estimate is {turns}; check that its encoder has been calibrated")
+        self.answer()
+
+    def end_cycle(self) -> None:
+        """Check whether this cycle's positions came from two nodes with the same id."""
+        if self._answers_per_request.from_two_nodes():
+            self.note_fault("frame", 0, warning(self.node, "each request has two positions"))
 
     def on_errors(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """Handle Get_Error: active errors and disarm reason."""

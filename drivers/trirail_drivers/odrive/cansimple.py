@@ -27,6 +27,9 @@ SET_CONTROLLER_MODE: Final = 0x0B
 SET_INPUT_POS: Final = 0x0C
 CLEAR_ERRORS: Final = 0x18
 
+ADDRESS_FIRMWARE: Final = (0, 6, 9)
+"""First firmware version with the message Address. In earlier versions, its command is Set_Axis_Node_ID."""
+
 VERSION: Final = Struct("<BBBBBBBB")
 """Get_Version: protocol; hardware product line, version, variant; firmware major, minor, revision, unreleased."""
 BEAT: Final = Struct("<IBBBx")

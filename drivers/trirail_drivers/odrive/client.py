@@ -27,13 +27,13 @@ class OdriveClient:
         self.answered = 0
         """Number of answered requests."""
         self._bus = bus
-        self._node = node
+        self.node = node
         self._beat: bytes | None = None
         """Data of the newest heartbeat that has not been returned yet."""
 
     def command(self, number: int, data: bytes) -> None:
         """Send a command, to which the drive sends no answer. Raises BusError."""
-        send_in_setup(self._bus, cansimple.command(self._node, number, data))
+        send_in_setup(self._bus, cansimple.command(self.node, number, data))
 
     async def request(self, number: int, message_name: str) -> bytes:
         """Request a message by its command number and return its data.
@@ -42,12 +42,25 @@ class OdriveClient:
         """
         data = await self.try_request(number)
         if data is None:
-            raise self._timeout_error(message_name)
+            raise self.timeout_error(message_name)
         return data
 
     async def try_request(self, number: int) -> bytes | None:
         """Request a message by its command number; return its data, or None if the drive does not send it."""
-        return await self._request(cansimple.request(self._node, number), number, lambda _: True)
+        return await self._request(cansimple.request(self.node, number), number, lambda _: True)
+
+    async def request_all(self, number: int) -> list[bytes]:
+        """Request a message by its command number; return the different data that arrive within one attempt.
+
+        The list is empty if no answer arrives, and has several items if nodes with the same id answer.
+        """
+        answers: list[bytes] = []
+        data = await self.try_request(number)
+        end = self.clock() + self.timeout / ATTEMPTS
+        while data is not None:
+            answers.append(data)
+            data = await self._receive(number, end, lambda data: data not in answers)
+        return answers
 
     async def read_setting(self, endpoint: int, path: str) -> bytes:
         """Read the bytes of the setting `path`, given its endpoint number.
@@ -56,12 +69,12 @@ class OdriveClient:
         """
         question = cansimple.SDO.pack(cansimple.READ, endpoint, 0)
         data = await self._request(
-            cansimple.command(self._node, cansimple.RX_SDO, question),
+            cansimple.command(self.node, cansimple.RX_SDO, question),
             cansimple.TX_SDO,
             lambda data: data[1:3] == question[1:3],  # the endpoint; a late answer has another one
         )
         if data is None:
-            raise self._timeout_error(f"RxSdo of {path}")
+            raise self.timeout_error(f"RxSdo of {path}")
         return data[cansimple.SDO.size :]
 
     async def heartbeat(self, deadline: float) -> bytes | None:
@@ -81,7 +94,7 @@ class OdriveClient:
         return None
 
     async def _receive(self, number: int, deadline: float, accepts: Callable[[bytes], bool]) -> bytes | None:
-        identifier, beats = (cansimple.identifier(self._node, each) for each in (number, cansimple.HEARTBEAT))
+        identifier, beats = (cansimple.identifier(self.node, each) for each in (number, cansimple.HEARTBEAT))
 
         def is_awaited(message: can.Message) -> bool:
             if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
@@ -93,6 +106,7 @@ class OdriveClient:
         frame = await Wait(is_awaited, deadline)
         return None if frame is None else bytes(frame.data)
 
-    def _timeout_error(self, message_name: str) -> DriveTimeout:
+    def timeout_error(self, message_name: str) -> DriveTimeout:
+        """Return the error for a message that the drive has not sent."""
         error = DriveTimeout if self.answered else DriveAbsentError
         return error(self.name, f"answer to {message_name}", self.timeout)

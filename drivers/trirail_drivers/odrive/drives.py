@@ -163,6 +163,7 @@ class Odrive(Driver[OdriveAxis]):
         now = self._clock()
         self._wire.receive(now)
         for axis in self._axes:
+            axis.end_cycle()
             end_reading(axis)
             if self._wire.fault is not None and axis.present:
                 axis.watch_silence(now, self._period)

@@ -24,6 +24,7 @@ import can
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.driver.conversations import run_concurrently
+from trirail_drivers.driver.duplicate_node import warning
 from trirail_drivers.driver.refusals import raise_combined, review_protections
 from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock
@@ -64,7 +65,7 @@ class OdriveIdentity(NamedTuple):
 
     version: Version
     serial: int | None
-    """Serial number; None if the firmware has no Address message."""
+    """Serial number; None if the drive does not report it."""
 
 
 class OdriveSetup(NamedTuple):
@@ -128,13 +129,11 @@ async def configure_one(
     """
     client, name = one.client, one.client.name
     _command_idle(client)
-    answer = await client.request(cansimple.GET_VERSION, "Get_Version")
-    version = Version.from_fields(*_unpacked(client, cansimple.VERSION, answer))
+    version = await _read_version(client)
     if version.firmware < MIN_FIRMWARE:
         raise DriveError(f"drive {name}: {version.description} is too old; update to 0.6.0 or newer")
     state = await _wait_until_idle(one)
-    address = await client.try_request(cansimple.ADDRESS)
-    serial = None if address is None else cansimple.serial_number(address)
+    serial = await _read_serial(client) if version.firmware >= cansimple.ADDRESS_FIRMWARE else None
     check(OdriveIdentity(version, serial))
     read = await settings.read(client, version, one.drive.endpoints)
     lacks = missing_protections(read, one.drives)
@@ -152,6 +151,30 @@ async def configure_one(
     notes += [RELATIVE] * relative
     made = OdriveSetup(name, OdriveIdentity(version, serial), relative, tuple(lacks), tuple(notes))
     return made, OdriveStart(turns, errors[0] | errors[1], state)
+
+
+async def _read_version(client: OdriveClient) -> Version:
+    answers = await client.request_all(cansimple.GET_VERSION)
+    if not answers:
+        raise client.timeout_error("Get_Version")
+    versions = [Version.from_fields(*_unpacked(client, cansimple.VERSION, answer)) for answer in answers]
+    _check_single(client, [version.description for version in versions])
+    return versions[0]
+
+
+async def _read_serial(client: OdriveClient) -> int | None:
+    """Return the serial number of a drive; None if the drive does not answer, or if its answer is too short."""
+    answers = await client.request_all(cansimple.ADDRESS)
+    serials = [serial for answer in answers if (serial := cansimple.serial_number(answer)) is not None]
+    _check_single(client, [f"serial number {serial:012X}" for serial in serials])
+    return serials[0] if serials else None
+
+
+def _check_single(client: OdriveClient, answers: list[str]) -> None:
+    """Raise DriveError if the different answers to one request show that two nodes have the drive's id."""
+    found = list(dict.fromkeys(answers))
+    if len(found) > 1:
+        raise DriveError(f"drive {client.name}: {warning(client.node, f'{found[0]} and {found[1]} answer')}")
 
 
 def _command_idle(client: OdriveClient) -> None:

@@ -134,7 +134,9 @@ class SimulatedOdrive:
             return
         self.poll(now)  # work that was due before the frame arrived
         self._fed = now
-        if command in _REQUESTS:
+        if command == cansimple.ADDRESS and self.version.firmware < cansimple.ADDRESS_FIRMWARE:
+            self.node = int.from_bytes(data[:4], "little")  # Set_Axis_Node_ID; a remote frame sets 0
+        elif command in _REQUESTS:
             if not data:
                 self._answer(command)
         elif command in self._handlers:
