@@ -10,9 +10,9 @@ from typing import Any
 import msgspec
 import pytest
 from drivers.test_odrive import CONFIG, PERIOD, Rig
-from hypothesis import example, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from rigs import Closing
+from rigs import START, Closing
 from trirail.config import SIM, load
 from trirail.config.loading import everything
 from trirail.errors import ConfigError
@@ -20,7 +20,17 @@ from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES
 from trirail_drivers.odrive import cansimple, flat_endpoints
 from trirail_drivers.odrive.flat_endpoints import KNOWN_TABLES, Version
-from trirail_drivers.odrive.protections import CYCLIC, HEARTBEAT, PROTECTIONS, SCALE, WATCHDOG, WATCHDOG_TIMEOUT
+from trirail_drivers.odrive.protections import (
+    ABSOLUTE_SETPOINTS,
+    CYCLIC,
+    FROM_POWER_ON,
+    HEARTBEAT,
+    PROTECTIONS,
+    SCALE,
+    UNCHECKED,
+    WATCHDOG,
+    WATCHDOG_TIMEOUT,
+)
 
 S1 = Version((5, 2, 0), (0, 6, 10))
 UNKNOWN = Version((5, 2, 0), (0, 6, 99))
@@ -169,14 +179,19 @@ def test_a_development_version_is_none_that_is_known(closing: Closing) -> None:
         rig.drives.configure(PERIOD)
 
 
-def table(version: Version, numbers: dict[str, int], types: dict[str, str] | None = None) -> str:
-    """A flat_endpoints.json, with what else such a file has."""
+def table(
+    version: Version,
+    numbers: dict[str, int],
+    types: dict[str, str] | None = None,
+    more: dict[str, tuple[int, str]] | None = None,
+) -> str:
+    """A flat_endpoints.json, with what else such a file has, and with `more` numbers and types."""
     (known,) = [each for each in KNOWN_TABLES if each.matches(S1)]
     each = {
         path: {"id": numbers.get(path, endpoint.id), "type": (types or {}).get(path, endpoint.type)}
         for path, endpoint in known.endpoints.items()
         if numbers.get(path) != -1
-    }
+    } | {path: {"id": number, "type": kind} for path, (number, kind) in (more or {}).items()}
     whole: dict[str, Any] = {
         "fw_version": ".".join(map(str, version.firmware)),
         "hw_version": ".".join(map(str, version.hardware)),
@@ -240,6 +255,61 @@ def test_a_table_that_is_not_there_is_told_by_the_doctor_and_refused_of_other_dr
     assert f"{tmp_path}/no.json: No such file" in found.text
     with pytest.raises(ConfigError, match="only ODrives have endpoints"):
         load(tmp_path / "elmo_gold.toml")
+
+
+@pytest.fixture
+def absolute(closing: Closing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    """Drives whose firmware, by the user's own table, has the setting absolute_setpoints."""
+    (tmp_path / "flat_endpoints.json").write_text(table(UNKNOWN, {}, more={ABSOLUTE_SETPOINTS: (700, "bool")}))
+    own = flat_endpoints.read("A", tmp_path / "flat_endpoints.json")
+    monkeypatch.setattr("trirail_drivers.simulated.odrive.KNOWN_TABLES", (own,))
+    rig = closing(Rig(with_file(tmp_path / "flat_endpoints.json")))
+    for device in rig.devices:
+        device.version = UNKNOWN
+    return rig
+
+
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(told=st.tuples(st.booleans(), st.booleans(), st.booleans()))
+def test_a_drive_whose_positions_count_from_power_on_is_named_with_the_remedy(
+    absolute: Rig, told: tuple[bool, bool, bool]
+) -> None:
+    for device, value in zip(absolute.devices, told, strict=True):
+        device.settings[ABSOLUTE_SETPOINTS] = value
+    absolute.drives.configure(PERIOD)
+    warnings = [line for line in absolute.drives.read().warnings if ABSOLUTE_SETPOINTS in line]
+    if all(told):
+        assert warnings == []
+    else:
+        (warning,) = warnings
+        assert f"{FROM_POWER_ON}" in warning
+        named = warning.partition(":")[0]
+        assert [name for name, value in zip(NAMES, told, strict=True) if not value] == [n for n in NAMES if n in named]
+
+
+@pytest.mark.parametrize("value", [True, False])
+def test_a_drive_that_restarts_keeps_its_position_only_if_its_positions_are_absolute(
+    absolute: Rig, value: bool
+) -> None:
+    absolute.devices[2].settings[ABSOLUTE_SETPOINTS] = value
+    absolute.ready()
+    assert absolute.cycles(50).homed == (True, True, True)
+    absolute.devices[2].restart(absolute.clock.now)
+    absolute.found("state", within=40)
+    for _ in range(3000):
+        if not any(absolute.cycle().unready):
+            break
+    absolute.drives.reset()
+    feedback = absolute.cycles(100)
+    assert feedback.fault is None
+    assert feedback.position == pytest.approx((*START[:2], START[2] if value else 0.0), abs=1e-6)
+    assert feedback.homed == (True, True, value)
+
+
+def test_firmware_whose_number_of_absolute_setpoints_is_unknown_is_named_with_the_remedy(closing: Closing) -> None:
+    rig = closing(Rig())
+    rig.drives.configure(PERIOD)
+    assert [line for line in rig.drives.read().warnings if line.endswith(UNCHECKED)]
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3])

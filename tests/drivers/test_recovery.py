@@ -365,11 +365,23 @@ def test_an_odrive_whose_position_is_relative_is_not_homed_after_a_restart() -> 
     rig.bus.shutdown()
 
 
-@pytest.mark.parametrize("seconds", [0.2, 0.4, 2.0])
-def test_an_odrive_whose_position_is_relative_keeps_it_through_silence(seconds: float) -> None:
+@pytest.mark.parametrize("line", ["A silent for 0.2", "A silent for 2", "bus-off for 0.4"])
+def test_an_odrive_whose_position_is_relative_is_not_homed_after_silence(line: str) -> None:
+    """It may have lost its supply, and have booted before it was heard again."""
     rig = relative_rig()
     rig.command("disable")
-    rig.bus.faults.add(f"A silent for {seconds}")
+    rig.bus.faults.add(line)
+    rig.cycles(200)
+    rig.until(rig.ready, ENDS)
+    assert isinstance(rig.command("reset"), CommandDone)
+    assert not rig.control.measured.homed
+    rig.bus.shutdown()
+
+
+def test_an_odrive_whose_position_is_relative_keeps_it_through_a_short_silence() -> None:
+    rig = relative_rig()
+    rig.command("disable")
+    rig.bus.faults.add("A silent for 0.1")
     rig.cycles(200)
     rig.until(rig.ready, ENDS)
     assert isinstance(rig.command("reset"), CommandDone)

@@ -579,7 +579,7 @@ def test_a_position_that_comes_twice_is_a_second_nodes_only_if_it_does_so_often(
         else:
             session.inject(CAN_FRAME.pack(0x029, 8, struct.pack("<ff", newest + 1e-3, 0.0)))
 
-    happens = {number: [Happening(say_once_more)] for number in range(100, 900, often)}
+    happens = {number: [Happening(say_once_more)] for number in range(300, 900, often)}
     one = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 900)
     fault = one.loop.control.fault
     assert fault is None if found is None else found in (fault or "")

@@ -21,12 +21,24 @@ CYCLIC: Final = tuple(
 POSITION_STATUS: Final = "axis0.pos_vel_mapper.status"
 RELATIVE_MODE: Final = 9
 """Value of POSITION_STATUS if positions are relative to the place where the drive was switched on."""
+ABSOLUTE_SETPOINTS: Final = "axis0.controller.config.absolute_setpoints"
+"""Setting that selects positions relative to the encoder; otherwise, positions count from the place at power-on."""
 RELATIVE: Final = (
     f"{POSITION_STATUS} is {RELATIVE_MODE}, relative: its position is lost with its supply; use an absolute encoder, "
     "or home it by odrivetool before each start of the service"
 )
 """Note about a drive in RELATIVE_MODE."""
-SETTINGS: Final = (WATCHDOG, WATCHDOG_TIMEOUT, SCALE, HEARTBEAT, *CYCLIC, POSITION_STATUS)
+FROM_POWER_ON: Final = (
+    f"{ABSOLUTE_SETPOINTS} is False: its position counts from the place where it was switched on, and is lost with its "
+    "supply; set it to True with odrivetool"
+)
+"""Note about a drive whose positions do not refer to its encoder."""
+UNCHECKED: Final = (
+    f"{ABSOLUTE_SETPOINTS} must be True, but has no known endpoint number; check it with odrivetool, or set endpoints "
+    "to its flat_endpoints.json"
+)
+"""Note about a drive that may lose its position with its supply."""
+SETTINGS: Final = (WATCHDOG, WATCHDOG_TIMEOUT, SCALE, HEARTBEAT, *CYCLIC, POSITION_STATUS, ABSOLUTE_SETPOINTS)
 REQUIRED: Final = frozenset((WATCHDOG, WATCHDOG_TIMEOUT, HEARTBEAT))
 """Settings that exist in every firmware since 0.6.
 
@@ -86,12 +98,13 @@ def missing_protections(settings: Settings | None, drives: Drives) -> dict[str, 
     return reasons
 
 
-def is_relative(settings: Settings | None) -> bool:
-    """Whether a drive reports that it loses its position when it loses its supply.
-
-    A drive that reports nothing is assumed to keep its position.
-    """
-    return settings is not None and settings.get(POSITION_STATUS) == RELATIVE_MODE
+def relative_position(settings: Settings | None) -> str:
+    """Return why a drive loses its position when it loses its supply, for people; "" if it does not report that."""
+    if settings is None:
+        return ""
+    if settings.get(POSITION_STATUS) == RELATIVE_MODE:
+        return RELATIVE
+    return "" if settings.get(ABSOLUTE_SETPOINTS, True) else FROM_POWER_ON
 
 
 def check_watchdog(name: str, settings: Settings | None, period: float) -> None:

@@ -25,8 +25,6 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         super().__init__(axis)
         self.one = one
         self._configured = configured
-        self._boots = 0
-        """Number of restarts up to the last set-up."""
 
     def start_setup(
         self, sender: FrameSender, clock: Clock
@@ -37,13 +35,13 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         return configure_one(one._replace(client=client), self._check), client
 
     def accept(self, made: OdriveSetup, begun: OdriveStart) -> str:
-        """Let the drive take part in the cycle. A drive whose position is relative counts as not homed if it has
-        restarted since its first set-up, which accepts the position as it is.
+        """Let the drive take part in the cycle.
+
+        A drive whose position is relative counts as not homed after every set-up except the first, which accepts the
+        position as it is: the drive has restarted, or it may have lost its supply and finished booting while silent.
         """
-        axis = self.axis
-        restarted, self._boots = axis.boots != self._boots, axis.boots
         self._configured(begun)
-        axis.homed = self.setup is None or not made.relative or (axis.homed and not restarted)
+        self.axis.homed = self.setup is None or not made.relative
         return ""
 
     def may_have_power(self, *, stopping: bool) -> bool:

@@ -5,6 +5,8 @@ The set-up writes no settings. The following settings must have been made with O
 - `axis0.config.can.node_id`; `heartbeat_msg_rate_ms` as in [drives]; `encoder_msg_rate_ms = 0` and the other cyclic
   messages off, since the driver requests every message that it needs, and other messages would only load the bus;
 - `axis0.config.can.input_vel_scale = 1000`, the default;
+- `axis0.controller.config.absolute_setpoints = True`. With False, the default, positions count from the place where the
+  drive was switched on, although the encoder is absolute;
 - `axis0.config.enable_watchdog = True`, with a `watchdog_timeout` of several cycles. Only the watchdog disarms a drive
   whose host has failed; every setpoint restarts the time-out;
 - gains, velocity and current limits, and a calibrated encoder that keeps its position without power.
@@ -32,7 +34,14 @@ from trirail_drivers.odrive import cansimple, settings
 from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.client import OdriveClient
 from trirail_drivers.odrive.flat_endpoints import Version
-from trirail_drivers.odrive.protections import PROTECTIONS, RELATIVE, check_watchdog, is_relative, missing_protections
+from trirail_drivers.odrive.protections import (
+    ABSOLUTE_SETPOINTS,
+    PROTECTIONS,
+    UNCHECKED,
+    check_watchdog,
+    missing_protections,
+    relative_position,
+)
 
 MIN_FIRMWARE: Final = (0, 6, 0)
 """First firmware version whose errors and heartbeats have the layout that this driver reads."""
@@ -147,9 +156,10 @@ async def configure_one(
     turns, _ = _unpacked(client, cansimple.ESTIMATES, estimates)
     if not math.isfinite(turns):
         raise DriveError(f"drive {name}: position estimate is {turns}; check that its encoder has been calibrated")
-    relative = is_relative(read)
-    notes += [RELATIVE] * relative
-    made = OdriveSetup(name, OdriveIdentity(version, serial), relative, tuple(lacks), tuple(notes))
+    relative = relative_position(read)
+    unchecked = UNCHECKED if read is not None and ABSOLUTE_SETPOINTS not in read else ""
+    notes += [note for note in (relative, unchecked) if note]
+    made = OdriveSetup(name, OdriveIdentity(version, serial), bool(relative), tuple(lacks), tuple(notes))
     return made, OdriveStart(turns, errors[0] | errors[1], state)
 
 

@@ -12,6 +12,7 @@ from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.flat_endpoints import KNOWN_TABLES, Version
+from trirail_drivers.odrive.protections import ABSOLUTE_SETPOINTS, POSITION_STATUS, RELATIVE_MODE
 from trirail_drivers.simulated.servo import Servo
 
 HARDWARE: Final = (4, 4, 58)
@@ -78,10 +79,14 @@ class SimulatedOdrive:
             f"{CAN}.input_vel_scale": 1000,
             f"{CAN}.heartbeat_msg_rate_ms": round(1000 * heartbeat),
             **{f"{CAN}.{name}_msg_rate_ms": 0 for name in (*_CYCLIC, *_UNSENT_CYCLIC)},
-            "axis0.pos_vel_mapper.status": 0,
+            POSITION_STATUS: 0,
+            ABSOLUTE_SETPOINTS: True,
         }
         """Settings by path. Their endpoint numbers are those of the drive's firmware."""
         self._input = (servo.position, 0.0)
+        """Position and velocity of the servo that were commanded last."""
+        self._zero = 0.0
+        """Position of the servo at which the drive reports 0."""
         self._friction = friction
         self._fed = self._moved_at = 0.0
         self._booted = NO_TIMEOUT
@@ -182,7 +187,12 @@ class SimulatedOdrive:
             self.axis_state = AxisState.IDLE
 
     def restart(self, now: float) -> None:
-        """Cycle the power supply: the drive restarts in idle and loses its modes and errors."""
+        """Cycle the power supply: the drive restarts in idle and loses its modes and errors.
+
+        A drive whose position is relative then counts from the present place.
+        """
+        if self.settings[POSITION_STATUS] == RELATIVE_MODE or not self.settings[ABSOLUTE_SETPOINTS]:
+            self._zero = self.servo.position
         self.axis_state, self.modes = AxisState.UNDEFINED, (VELOCITY_CONTROL, cansimple.PASSTHROUGH)
         self.errors, self.disarm_reason, self.result = Error.INITIALIZING, Error(0), ProcedureResult.SUCCESS
         self._booted = now + BOOT
@@ -211,7 +221,7 @@ class SimulatedOdrive:
         elif command == cansimple.GET_ERROR:
             data = cansimple.ERRORS.pack(self.errors, self.disarm_reason)
         else:
-            data = cansimple.ESTIMATES.pack(self.servo.position, self.servo.velocity)
+            data = cansimple.ESTIMATES.pack(self.servo.position - self._zero, self.servo.velocity)
         self._send(command, data)
 
     def _sdo(self, data: bytes) -> None:
@@ -256,7 +266,7 @@ class SimulatedOdrive:
     def _set_input(self, data: bytes) -> None:
         position, velocity, _ = cansimple.INPUT_POS.unpack(data)
         if math.isfinite(position):
-            self._input = position, velocity / self.settings[f"{CAN}.input_vel_scale"]
+            self._input = position + self._zero, velocity / self.settings[f"{CAN}.input_vel_scale"]
         else:
             self.fail(Error.MISSING_INPUT)
 
