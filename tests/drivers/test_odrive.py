@@ -12,6 +12,8 @@ import msgspec
 import numpy as np
 import pytest
 from control_rig import CONFIG as ROBOT
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rigs import ENABLED, OFF, START, STEP, Bus, Clock, Closing, DriverRig, frame, ideal_servo
 from trirail.config import Config
@@ -20,6 +22,7 @@ from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.odrive import cansimple
+from trirail_drivers.odrive.axis import ENABLE_ATTEMPTS
 from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.codes import describe_errors
 from trirail_drivers.odrive.drives import MODES_SENT, Odrive
@@ -170,6 +173,37 @@ class TestConfigure:
         with pytest.raises(DriveError, match=r"drive A: firmware 0\.5\.6 on .* is too old; update to 0\.6\.0"):
             new.drives.configure(PERIOD)
 
+    @pytest.mark.parametrize("awaits", [False, True])
+    def test_firmware_that_reports_no_version_is_too_old(self, new: Rig, awaits: bool) -> None:
+        """Firmware 0.5 sends heartbeats, but knows neither Get_Version nor Get_Error."""
+        device = new.devices[1]
+        answer = device._answer
+        device._answer = lambda command: answer(command) if command == cansimple.HEARTBEAT else None  # type: ignore[method-assign]
+        said = r"^drive B: sends heartbeats but no version: its firmware is older than 0\.6\.0; update it"
+        with pytest.raises(DriveError, match=said):
+            new.drives.configure(PERIOD, awaits=awaits)
+
+    def test_a_drive_that_was_disarmed_while_it_booted_is_not_booting(self, new: Rig) -> None:
+        """Its disarm reason is an error like any other: reported, and cleared by a reset."""
+        new.devices[1].disarm_reason = Error.INITIALIZING
+        new.ready()
+        assert new.found("fault", within=1).message.startswith("drive B: error 0x00000001 INITIALIZING (it is starting")
+        new.drives.reset()
+        feedback = new.cycles(300)
+        assert (feedback.fault, feedback.state) == (None, OFF)
+        assert new.devices[1].disarm_reason == Error(0)
+
+    def test_a_drive_that_is_still_booting_is_awaited(self, new: Rig) -> None:
+        new.devices[1].errors = Error.INITIALIZING
+        new.devices[1]._booted = new.clock.now + 0.05
+        new.ready()
+        assert new.cycles(300).fault is None
+
+    def test_a_drive_that_does_not_finish_booting_is_named(self, new: Rig) -> None:
+        new.devices[1].errors = Error.INITIALIZING
+        with pytest.raises(DriveError, match=r"^drive B: still reports INITIALIZING after 0\.3 s; restart the drive$"):
+            new.ready()
+
     def test_drive_that_does_not_know_where_it_is(self, new: Rig) -> None:
         new.devices[2].servo.position = math.nan
         with pytest.raises(DriveError, match=r"drive C: position estimate is nan"):
@@ -211,6 +245,33 @@ class TestPower:
         assert ready.found("state", within=250).message == "drive C: refuses closed loop control: not calibrated"
         ready.cycles(150)
         assert {device.axis_state for device in ready.devices} == {AxisState.IDLE}
+
+    @settings(max_examples=20)
+    @example(lost=1, index=1, result=ProcedureResult.DISARMED)
+    @given(
+        lost=st.integers(1, ENABLE_ATTEMPTS - 1), index=st.integers(0, 2), result=st.sampled_from([*ProcedureResult])
+    )
+    def test_a_request_that_is_lost_is_sent_again(self, lost: int, index: int, result: ProcedureResult) -> None:
+        """Whatever the result of the drive's procedure before is, except that it is still busy."""
+        assume(result is not ProcedureResult.BUSY)
+        rig = Rig()
+        rig.devices[index].result = result
+        rig.ready()
+        rig.cycles(150)  # heartbeats with this result
+        rig.bus.faults.add(f"{'ABC'[index]} drop set_axis_state for {lost} frames")
+        rig.drives.enable()
+        feedback = rig.cycles(250 * (lost + 1))
+        assert (feedback.state, feedback.fault) == (ENABLED, None)
+        told = [command for command in rig.commands()[index] if command == CLOSED_LOOP]
+        assert len(told) == lost + 1
+        rig.drives.close()
+
+    def test_a_refusal_for_the_same_reason_as_before_is_named(self, ready: Rig) -> None:
+        ready.devices[2].calibrated, ready.devices[2].result = False, ProcedureResult.NOT_CALIBRATED
+        ready.cycles(150)
+        ready.drives.enable()
+        found = ready.found("state", within=250 * ENABLE_ATTEMPTS)
+        assert found.message == "drive C: refuses closed loop control: not calibrated"
 
     def test_heartbeat_from_before_the_request_is_no_refusal(self, ready: Rig) -> None:
         ready.cycle()
@@ -466,8 +527,22 @@ class TestReset:
         enabled.drives.reset()
         feedback = enabled.cycles(300)
         assert (feedback.state, feedback.fault) == (OFF, None)
-        assert enabled.commands() == [[], [], [(cansimple.CLEAR_ERRORS, 0)] * 2]
+        cleared = (cansimple.CLEAR_ERRORS, 0)
+        assert [set(commands) for commands in enabled.commands()] == [{cleared}] * 3
         enabled.enable()
+
+    @pytest.mark.parametrize("index", [1, 2])
+    def test_clears_errors_that_are_not_known_yet(self, enabled: Rig, index: int) -> None:
+        """Drives that lose their supply together report it one after the other."""
+        enabled.cycles(50)
+        for device in (enabled.devices[0], enabled.devices[index]):
+            device.disarm_reason = Error.DC_BUS_UNDER_VOLTAGE
+            device.axis_state = AxisState.IDLE
+        assert enabled.found("fault", within=40).drive in {"A", "ABC"[index]}
+        enabled.drives.quick_stop()
+        enabled.cycle()
+        enabled.drives.reset()
+        assert enabled.cycles(400).fault is None
 
     def test_while_the_cause_lasts_the_fault_comes_back(self, ready: Rig) -> None:
         ready.cycle()
@@ -506,8 +581,13 @@ def test_a_drive_whose_state_is_unknown_has_restarted_only_if_it_says_so(ready: 
     axis.on_errors(cansimple.ERRORS.pack(errors, 0), ready.clock.now)
     assert not axis.restarted
     assert axis.event is None
-    starting = [int(Error.INITIALIZING), 0] if errors else [0, int(Error.INITIALIZING)]
-    axis.on_errors(cansimple.ERRORS.pack(*starting), ready.clock.now)
+    axis.on_errors(cansimple.ERRORS.pack(errors, int(Error.INITIALIZING)), ready.clock.now)
+    axis.on_heartbeat(cansimple.BEAT.pack(int(Error.INITIALIZING), AxisState.IDLE, 0, 0), ready.clock.now)
+    assert not axis.restarted, "that is why it was disarmed"
+    if errors:
+        axis.on_errors(cansimple.ERRORS.pack(int(Error.INITIALIZING), 0), ready.clock.now)
+    else:
+        axis.on_heartbeat(cansimple.BEAT.pack(0, AxisState.UNDEFINED, 0, 0), ready.clock.now)
     assert axis.restarted
     assert axis.boots == 1
 

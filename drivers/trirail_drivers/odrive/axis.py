@@ -14,13 +14,17 @@ from trirail_drivers.driver.row_updates import accept_turns
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import cansimple
-from trirail_drivers.odrive.cansimple import AxisState, ProcedureResult
+from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.codes import describe_errors
 
 RESET_TIME = 3 * 3 * cansimple.ERROR_PERIOD
 """Time after Clear_Errors during which errors do not yet count as a fault [s]: three error requests to each drive."""
 STALE_HEARTBEATS = 1
 """Number of heartbeats after a request for a new axis state that may still show the previous state."""
+ENABLE_ATTEMPTS = 3
+"""Number of requests for closed-loop control after which an unchanged procedure result is a refusal. Before, it may be
+the result of an earlier procedure, because a request was lost.
+"""
 
 
 class OdriveAxis(Axis):
@@ -46,13 +50,18 @@ class OdriveAxis(Axis):
         """Axis state requested last; None makes the driver request the target state again."""
         self.modes_sent = 0
         """Number of controller modes sent since the drive was enabled."""
+        self.attempts = 0
+        """Number of requests for closed-loop control since the drive was enabled."""
         self.reset_until = -math.inf
         """Time until which cleared errors may persist [s]."""
         self._beats = 0
         """Number of heartbeats since the last request."""
         self._started = False
-        """Whether a heartbeat has shown that the drive is no longer booting."""
+        """Whether the drive is known to have finished booting."""
         self._result: int = ProcedureResult.SUCCESS
+        """Procedure result in the newest heartbeat."""
+        self._result_before: int = ProcedureResult.SUCCESS
+        """Procedure result at the last request."""
         self._answers_per_request = AnswersPerSync(self)
 
     def is_steady(self, wanted: AxisState | None) -> bool:
@@ -101,7 +110,7 @@ class OdriveAxis(Axis):
         self.position = self.scale.metres(turns)
         self.state, self.reported, self._started = state, True, True
         self.note_request(AxisState.IDLE)
-        self._update_errors(errors, state)
+        self._update_errors(errors)
 
     def rejoin(self, now: float) -> None:
         """Let the drive take part in the cycle again after a set-up in the background."""
@@ -134,16 +143,20 @@ class OdriveAxis(Axis):
         """Handle Get_Error: active errors and disarm reason."""
         active, reason = cansimple.ERRORS.unpack(data)
         self.reported = True
-        self._update_errors(active | reason)  # the state may be unknown, which does not show a restart
+        self._update_errors(active | reason)
+        if active & Error.INITIALIZING:
+            self._note_boot()
+        elif self.state != AxisState.UNDEFINED:
+            self._started = True
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Handle a heartbeat: axis state, errors and procedure result."""
         errors, self.state, self._result, _ = cansimple.BEAT.unpack(data)
         self.heard = now
         self._beats += 1
-        self._update_errors(errors, self.state)
-        if not cansimple.is_starting(self.state, errors):
-            self._started = True
+        self._update_errors(errors)
+        if self.state == AxisState.UNDEFINED:  # INITIALIZING may be a disarm reason here, which outlasts the boot
+            self._note_boot()
         if self.requested is not AxisState.CLOSED_LOOP_CONTROL:
             # Request idle again if the drive has power that the service does not want. A drive that has restarted may
             # finish the procedures of its own start first, such as an index search, without which it has no position.
@@ -158,14 +171,13 @@ class OdriveAxis(Axis):
     def note_request(self, state: AxisState) -> None:
         """Record that a state was requested from the drive."""
         self.requested = state
-        self._beats = 0
+        self.attempts += state is AxisState.CLOSED_LOOP_CONTROL
+        self._beats, self._result_before = 0, self._result
 
     def clear_faults(self, now: float) -> None:
         """Forget the latched event, but not a condition that persists, and give the drive time to clear its errors."""
-        if self.configured:
-            self.event = None
-        if self.errors:
-            self.reset_until = now + RESET_TIME
+        self.event = None
+        self.reset_until = now + RESET_TIME
 
     def power(self, follows: bool) -> PowerState:
         """Return the state of CiA 402 that corresponds to the axis state and the errors.
@@ -220,17 +232,18 @@ class OdriveAxis(Axis):
         """Whether the newest heartbeat was sent after the drive received the last request."""
         return self._beats > STALE_HEARTBEATS
 
-    def _update_errors(self, errors: int, state: int = AxisState.IDLE) -> None:
-        """Store the errors of a message, and watch for a restart; `state` is the axis state in the message, if any."""
+    def _update_errors(self, errors: int) -> None:
+        """Store the errors of a message."""
         self.errors = errors
         if not errors:
             self.reset_until = -math.inf
-        # A drive that has finished booting reports INITIALIZING or an undefined state only if it boots again.
-        if self._started and cansimple.is_starting(state, errors):
-            self._note_restart()
 
-    def _note_restart(self) -> None:
-        """Record that the drive is booting. It may be a different drive, or may have lost its settings or position."""
+    def _note_boot(self) -> None:
+        """Record that the drive is booting, if it had finished booting before. It may be a different drive, or may have
+        lost its settings or position.
+        """
+        if not self._started:
+            return
         self._started, self.state = False, AxisState.UNDEFINED
         self.restarted, self.boots = True, self.boots + 1
         # This replaces an earlier event, which the restart explains.
@@ -239,7 +252,13 @@ class OdriveAxis(Axis):
         )
 
     def _watch_refusal(self) -> None:
-        if self._result in (ProcedureResult.SUCCESS, ProcedureResult.BUSY):
+        """Latch a fault if the drive refuses closed-loop control; request it again if the request may be lost."""
+        if self._result == ProcedureResult.BUSY:
+            return
+        is_new = self._result != self._result_before or self.attempts >= ENABLE_ATTEMPTS
+        if self._result == ProcedureResult.SUCCESS or not is_new:
+            if self.state == AxisState.IDLE and not self.errors:
+                self.requested = None
             return
         try:
             result = ProcedureResult(self._result).name.lower().replace("_", " ")

@@ -130,6 +130,7 @@ class ProcedureResult(IntEnum):
     INVALID_STATE = 13
     NOT_CALIBRATED = 14
     NOT_CONVERGING = 15
+    REQUESTED_CURRENT_TOO_HIGH = 16
 
 
 class Error(IntFlag):
@@ -151,6 +152,7 @@ class Error(IntFlag):
     INVERTER_OVER_TEMP = 1 << 14
     VELOCITY_LIMIT_VIOLATION = 1 << 15
     POSITION_LIMIT_VIOLATION = 1 << 16
+    REQUESTED_CURRENT_TOO_HIGH = 1 << 17
     WATCHDOG_TIMER_EXPIRED = 1 << 24
     ESTOP_REQUESTED = 1 << 25
     SPINOUT_DETECTED = 1 << 26
@@ -183,11 +185,6 @@ def serial_number(address: bytes) -> int | None:
     """Return the serial number in an Address message, or None if the message is too short to contain one."""
     data = address[SERIAL_AT]
     return int.from_bytes(data, "little") if len(data) == SERIAL_AT.stop - SERIAL_AT.start else None
-
-
-def is_starting(state: int, errors: int) -> bool:
-    """Whether an axis state or error bits show that the drive is booting."""
-    return state == AxisState.UNDEFINED or bool(errors & Error.INITIALIZING)
 
 
 def state_name(state: int) -> str:

@@ -9,7 +9,7 @@ from trirail_drivers.odrive.cansimple import Error
 _TUNING: Final = "check load, limits and gains"
 _SUPPLY: Final = "check supply and brake resistor: braking feeds energy back"
 _WORDS: Final = {
-    Error.INITIALIZING: ("it is starting", "wait; if it stays, restart the drive"),
+    Error.INITIALIZING: ("it is starting, or was when it lost power", "wait; reset; if it stays, restart the drive"),
     Error.SYSTEM_LEVEL: ("its firmware failed", "restart it; update its firmware"),
     Error.TIMING_ERROR: ("its processor is overloaded", "switch off features that are not needed"),
     Error.MISSING_ESTIMATE: ("it does not know where its motor is", "calibrate the encoder; check its cable"),
@@ -25,6 +25,7 @@ _WORDS: Final = {
     Error.INVERTER_OVER_TEMP: ("power stage too hot", "let it cool down; check load and airflow"),
     Error.VELOCITY_LIMIT_VIOLATION: ("velocity beyond its limit", _TUNING),
     Error.POSITION_LIMIT_VIOLATION: ("position beyond its limit", "check its limits and counts_per_metre"),
+    Error.REQUESTED_CURRENT_TOO_HIGH: ("requested motor current too high", _TUNING),
     Error.WATCHDOG_TIMER_EXPIRED: (
         "no setpoint came in time",
         "was the service stopped or too slow? cable, terminators; trirail doctor",

@@ -251,7 +251,7 @@ class Odrive(Driver[OdriveAxis]):
         for axis in self._axes:
             axis.powered_up = False
             axis.left_out = alone not in (None, axis.name)
-            axis.requested, axis.modes_sent = None, 0
+            axis.requested, axis.modes_sent, axis.attempts = None, 0, 0
 
     def home(self) -> None:
         """Do nothing, since the configuration refuses homing for ODrives."""
@@ -295,10 +295,8 @@ class Odrive(Driver[OdriveAxis]):
         if not self._enabled:
             self._start_stop_timer("reset")
         for axis in self._axes:
-            if not axis.configured:
-                continue
-            axis.clear_faults(now)
-            if axis.errors:
+            if axis.configured:  # its errors may not be known yet
+                axis.clear_faults(now)
                 self._clear_errors(axis)
 
     def _clear_errors(self, axis: OdriveAxis) -> None:

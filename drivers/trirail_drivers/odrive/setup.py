@@ -31,7 +31,7 @@ from trirail_drivers.driver.refusals import raise_combined, review_protections
 from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock
 from trirail_drivers.odrive import cansimple, settings
-from trirail_drivers.odrive.cansimple import AxisState
+from trirail_drivers.odrive.cansimple import AxisState, Error
 from trirail_drivers.odrive.client import OdriveClient
 from trirail_drivers.odrive.flat_endpoints import Version
 from trirail_drivers.odrive.protections import (
@@ -138,7 +138,7 @@ async def configure_one(
     """
     client, name = one.client, one.client.name
     _command_idle(client)
-    version = await _read_version(client)
+    version = await _read_version(one)
     if version.firmware < MIN_FIRMWARE:
         raise DriveError(f"drive {name}: {version.description} is too old; update to 0.6.0 or newer")
     state = await _wait_until_idle(one)
@@ -163,9 +163,16 @@ async def configure_one(
     return made, OdriveStart(turns, errors[0] | errors[1], state)
 
 
-async def _read_version(client: OdriveClient) -> Version:
+async def _read_version(one: OdriveSetupTask) -> Version:
+    client = one.client
+    deadline = client.clock() + MISSED_HEARTBEATS * one.drives.heartbeat
     answers = await client.request_all(cansimple.GET_VERSION)
     if not answers:
+        if await client.heartbeat(deadline) is not None:
+            raise DriveError(
+                f"drive {client.name}: sends heartbeats but no version: its firmware is older than 0.6.0; "
+                "update it to 0.6.0 or newer"
+            )
         raise client.timeout_error("Get_Version")
     versions = [Version.from_fields(*_unpacked(client, cansimple.VERSION, answer)) for answer in answers]
     _check_single(client, [version.description for version in versions])
@@ -192,24 +199,40 @@ def _command_idle(client: OdriveClient) -> None:
 
 
 async def _wait_until_idle(one: OdriveSetupTask) -> int:
-    """Wait until a heartbeat shows that the drive is idle, at most for the longest boot time; return the axis state."""
+    """Wait until a drive has booted and its heartbeat shows that it is idle, at most for the longest boot time.
+
+    Return the axis state.
+    """
     client = one.client
     begun, within = client.clock(), MISSED_HEARTBEATS * one.drives.heartbeat
     state: int | None = None
     while True:
         data = await client.heartbeat(begun + within)
-        if data is None and state is None:
-            raise DriveTimeout(client.name, "heartbeat (heartbeat_msg_rate_ms)", within)
         if data is None:
-            name = cansimple.state_name(state or 0)
-            raise DriveError(f"drive {client.name}: did not power off: its state is {name}, expected idle")
+            raise _idle_error(client, state, within)
         errors, state, _, _ = _unpacked(client, cansimple.BEAT, data)
-        if cansimple.is_starting(state, errors):
-            within = max(within, BOOT_TIMEOUTS * client.timeout)
-        elif state == AxisState.IDLE:
+        if state == AxisState.IDLE and not (errors & Error.INITIALIZING and await _is_initializing(client)):
             return state
+        if state in (AxisState.IDLE, AxisState.UNDEFINED):
+            within = max(within, BOOT_TIMEOUTS * client.timeout)
         else:  # commanded again after each heartbeat, since a command may be lost
             _command_idle(client)
+
+
+async def _is_initializing(client: OdriveClient) -> bool:
+    """Whether INITIALIZING is an active error. In a heartbeat, it may be a disarm reason, which outlasts the boot."""
+    active, _ = _unpacked(client, cansimple.ERRORS, await client.request(cansimple.GET_ERROR, "Get_Error"))
+    return bool(active & Error.INITIALIZING)
+
+
+def _idle_error(client: OdriveClient, state: int | None, within: float) -> DriveError:
+    """Return the error for a drive that is not idle after `within` seconds, given its last axis state, if any."""
+    if state is None:
+        return DriveTimeout(client.name, "heartbeat (heartbeat_msg_rate_ms)", within)
+    if state in (AxisState.IDLE, AxisState.UNDEFINED):
+        return DriveError(f"drive {client.name}: still reports INITIALIZING after {within:g} s; restart the drive")
+    name = cansimple.state_name(state)
+    return DriveError(f"drive {client.name}: did not power off: its state is {name}, expected idle")
 
 
 def _unpacked(client: OdriveClient, layout: struct.Struct, data: bytes) -> tuple[Any, ...]:
