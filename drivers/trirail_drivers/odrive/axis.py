@@ -21,9 +21,9 @@ RESET_TIME = 3 * 3 * cansimple.ERROR_PERIOD
 """Time after Clear_Errors during which errors do not yet count as a fault [s]: three error requests to each drive."""
 STALE_HEARTBEATS = 1
 """Number of heartbeats after a request for a new axis state that may still show the previous state."""
-ENABLE_ATTEMPTS = 3
-"""Number of requests for closed-loop control after which an unchanged procedure result is a refusal. Before, it may be
-the result of an earlier procedure, because a request was lost.
+ENABLE_ATTEMPTS = 2
+"""Number of requests for closed-loop control after which the procedure result shows whether the drive refuses. After
+one request, which may be lost, it may be the result of an earlier procedure.
 """
 
 
@@ -60,8 +60,6 @@ class OdriveAxis(Axis):
         """Whether the drive is known to have finished booting."""
         self._result: int = ProcedureResult.SUCCESS
         """Procedure result in the newest heartbeat."""
-        self._result_before: int = ProcedureResult.SUCCESS
-        """Procedure result at the last request."""
         self._answers_per_request = AnswersPerSync(self)
 
     def is_steady(self, wanted: AxisState | None) -> bool:
@@ -172,7 +170,7 @@ class OdriveAxis(Axis):
         """Record that a state was requested from the drive."""
         self.requested = state
         self.attempts += state is AxisState.CLOSED_LOOP_CONTROL
-        self._beats, self._result_before = 0, self._result
+        self._beats = 0
 
     def clear_faults(self, now: float) -> None:
         """Forget the latched event, but not a condition that persists, and give the drive time to clear its errors."""
@@ -255,8 +253,7 @@ class OdriveAxis(Axis):
         """Latch a fault if the drive refuses closed-loop control; request it again if the request may be lost."""
         if self._result == ProcedureResult.BUSY:
             return
-        is_new = self._result != self._result_before or self.attempts >= ENABLE_ATTEMPTS
-        if self._result == ProcedureResult.SUCCESS or not is_new:
+        if self._result == ProcedureResult.SUCCESS or self.attempts < ENABLE_ATTEMPTS:
             if self.state == AxisState.IDLE and not self.errors:
                 self.requested = None
             return
