@@ -175,11 +175,11 @@ class TestConfigure:
 
     @pytest.mark.parametrize("awaits", [False, True])
     def test_firmware_that_reports_no_version_is_too_old(self, new: Rig, awaits: bool) -> None:
-        """Firmware 0.5 sends heartbeats, but knows neither Get_Version nor Get_Error."""
-        device = new.devices[1]
+        """Firmware 0.5 sends heartbeats and answers position requests, but knows neither Get_Version nor Get_Error."""
+        device, known = new.devices[1], {cansimple.HEARTBEAT, cansimple.GET_ENCODER_ESTIMATES}
         answer = device._answer
-        device._answer = lambda command: answer(command) if command == cansimple.HEARTBEAT else None  # type: ignore[method-assign]
-        said = r"^drive B: sends heartbeats but no version: its firmware is older than 0\.6\.0; update it"
+        device._answer = lambda command: answer(command) if command in known else None  # type: ignore[method-assign]
+        said = r"^drive B: has no Get_Version; its firmware is too old; update to 0\.6\.0 or newer$"
         with pytest.raises(DriveError, match=said):
             new.drives.configure(PERIOD, awaits=awaits)
 
@@ -239,13 +239,12 @@ class TestPower:
         ready.drives.sync()
         assert ready.commands() == [[], [], []]
 
-    def test_refusal_is_named(self, ready: Rig) -> None:
-        ready.devices[2].calibrated = False
+    @pytest.mark.parametrize("before", [ProcedureResult.SUCCESS, ProcedureResult.NOT_CALIBRATED])
+    def test_refusal_is_named(self, ready: Rig, before: ProcedureResult) -> None:
+        ready.devices[2].calibrated, ready.devices[2].result = False, before
         ready.drives.enable()
-        assert (
-            ready.found("state", within=250 * ENABLE_ATTEMPTS).message
-            == "drive C: refuses closed loop control: not calibrated"
-        )
+        fault = ready.found("state", within=250 * ENABLE_ATTEMPTS)
+        assert fault.message == "drive C: refuses closed loop control: not calibrated"
         ready.cycles(150)
         assert {device.axis_state for device in ready.devices} == {AxisState.IDLE}
 

@@ -108,7 +108,11 @@ CANSIMPLE: dict[str, dict[str, object]] = {
             "float": "<f",
         },
     },
-    "Address: command id, and bytes 1 to 6 for the serial number": {"ADDRESS": 0x06, "SERIAL_AT": slice(1, 7)},
+    "Address: command id, and bytes 1 to 6 for the serial number": {
+        "ADDRESS": 0x06,
+        "ADDRESS_FIRMWARE": (0, 6, 9),
+        "SERIAL_AT": slice(1, 7),
+    },
     "units, and node ids of six bits without 3Fh": {
         "VELOCITY_SCALE": 1000,
         "VELOCITY_STEP": 0.001,
@@ -343,5 +347,5 @@ def test_the_odrive_driver_by_its_bytes() -> None:
     rig.cycles(50)
     sent(rig.bus)
     rig.drives.reset()
-    assert sent(rig.bus) == ["0F8#00"]
+    assert sent(rig.bus) == ["018#00", "0F8#00", "7D8#00"]
     rig.drives.close()

@@ -172,11 +172,6 @@ class OdriveAxis(Axis):
         self.attempts += state is AxisState.CLOSED_LOOP_CONTROL
         self._beats = 0
 
-    def clear_faults(self, now: float) -> None:
-        """Forget the latched event, but not a condition that persists, and give the drive time to clear its errors."""
-        self.event = None
-        self.reset_until = now + RESET_TIME
-
     def power(self, follows: bool) -> PowerState:
         """Return the state of CiA 402 that corresponds to the axis state and the errors.
 

@@ -29,7 +29,7 @@ from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.driver.row_updates import count_sync, due_setpoint, end_reading
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import cansimple, setup
-from trirail_drivers.odrive.axis import OdriveAxis
+from trirail_drivers.odrive.axis import RESET_TIME, OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.lending import CycleTableWriter
 from trirail_drivers.odrive.other_masters import listen_for_masters
@@ -295,8 +295,11 @@ class Odrive(Driver[OdriveAxis]):
         if not self._enabled:
             self._start_stop_timer("reset")
         for axis in self._axes:
-            if axis.configured:  # its errors may not be known yet
-                axis.clear_faults(now)
+            if not axis.configured:
+                continue
+            axis.event = None
+            if axis.errors or not self._enabled:  # errors of a drive that has lost power may not be known yet
+                axis.reset_until = now + RESET_TIME
                 self._clear_errors(axis)
 
     def _clear_errors(self, axis: OdriveAxis) -> None:

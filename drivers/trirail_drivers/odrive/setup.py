@@ -168,10 +168,10 @@ async def _read_version(one: OdriveSetupTask) -> Version:
     deadline = client.clock() + MISSED_HEARTBEATS * one.drives.heartbeat
     answers = await client.request_all(cansimple.GET_VERSION)
     if not answers:
-        if await client.heartbeat(deadline) is not None:
+        has_heartbeat = await client.heartbeat(deadline) is not None
+        if has_heartbeat and await client.try_request(cansimple.GET_ENCODER_ESTIMATES) is not None:
             raise DriveError(
-                f"drive {client.name}: sends heartbeats but no version: its firmware is older than 0.6.0; "
-                "update it to 0.6.0 or newer"
+                f"drive {client.name}: has no Get_Version; its firmware is too old; update to 0.6.0 or newer"
             )
         raise client.timeout_error("Get_Version")
     versions = [Version.from_fields(*_unpacked(client, cansimple.VERSION, answer)) for answer in answers]
@@ -189,9 +189,10 @@ async def _read_serial(client: OdriveClient) -> int | None:
 
 def _check_single(client: OdriveClient, answers: list[str]) -> None:
     """Raise DriveError if the different answers to one request show that two nodes have the drive's id."""
-    found = list(dict.fromkeys(answers))
-    if len(found) > 1:
-        raise DriveError(f"drive {client.name}: {warning(client.node, f'{found[0]} and {found[1]} answer')}")
+    first, *others = dict.fromkeys(answers) or ("",)
+    if others:
+        problem = warning(client.node, f"{first} and {others[0]} answer")
+        raise DriveError(f"drive {client.name}: {problem}")
 
 
 def _command_idle(client: OdriveClient) -> None:
