@@ -50,7 +50,7 @@ BOUNDS = (
     Bound("No sign of life from the gateway", ("watchdogs.gateway_timeout",), "controlled stop"),
     Bound("No sign of life from a process", ("trirail.processes.supervisor:MAX_SILENCE_S s",),
           "killed; the gateway is restarted, without the loop the service ends"),
-    Bound("Controlled stop when the service ends", ("trirail.processes.loop:MAX_SHUTDOWN_S s",),
+    Bound("Controlled stop when the service ends", ("trirail.processes.ending:MAX_SHUTDOWN_S s",),
           "the drives' quick stop"),
     Bound("Goals that wait for the active one", ("motion.queue",), "refused, `queue_full`"),
     Bound("Unread messages, of one user and of all", ("trirail.processes.inbox:MAX_MESSAGES_OF_USER messages",

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import msgspec
 import pytest
 from conftest import Followers, Rig, alone, what_memory_takes
 from control_rig import CONFIG
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from trirail.config import Config
 from trirail.errors import RefusalCode
 from trirail.motion.motion_planner import MotionPlanner
+from trirail.processes import ending
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.incoming import Incoming
@@ -81,6 +84,10 @@ class Shell:
         self.loop = Loop(rig.config, rig.driver, self.ports, self.heartbeats, now=lambda: round(rig.now * 1e9))
         self.loop.control.start(rig.control.measured.feedback)
 
+    def close(self) -> None:
+        for each in (self.gateway, self.recorder, self.planner, *self.ports):
+            each.close()
+
     def cycles(self, number: int, missed: int = 0) -> None:
         for _ in range(number):
             self.rig.now += self.rig.config.period
@@ -118,13 +125,8 @@ class Shell:
 
 @pytest.fixture
 def shell(rig: Rig, tmp_path: Path) -> Iterator[Shell]:
-    made = Shell(rig, tmp_path)
-    yield made
-    made.gateway.close()
-    made.recorder.close()
-    made.planner.close()
-    for port in made.ports:
-        port.close()
+    with closing(Shell(rig, tmp_path)) as made:
+        yield made
 
 
 def test_every_cycle_has_its_record_and_every_event_its_number(shell: Shell) -> None:
@@ -343,6 +345,59 @@ def test_it_ends_when_the_robot_has_no_power(shell: Shell) -> None:
     assert not shell.loop._has_ended()  # the drives have not said so yet
     shell.cycles(5)
     assert shell.loop._has_ended()
+
+
+KEEPING = "A drop rpdo1 rpdo2 rpdo3 sdo-request nmt"
+"""Fault with which drive A receives nothing that would remove its power."""
+GENTLE = msgspec.structs.replace(CONFIG.limits.platform, acceleration=(0.01, 0.01, 0.1), jerk=(0.1, 0.1, 1.0))
+"""Limits with which a controlled stop takes longer than the service's end allows."""
+
+
+@contextmanager
+def ending_shell(config: Config, **drives: float) -> Iterator[Shell]:
+    """A loop at 100 Hz, whose drives are configured like this."""
+    loop = msgspec.structs.replace(CONFIG.loop, rate_hz=100)
+    config = msgspec.structs.replace(config, loop=loop, drives=msgspec.structs.replace(config.drives, **drives))
+    with TemporaryDirectory() as folder, closing(Shell(Rig(config), Path(folder))) as shell:
+        shell.enabled()
+        yield shell
+    shell.rig.bus.shutdown()
+
+
+def end(shell: Shell) -> float:
+    """End the loop, and return how long that took [s]."""
+    began, shell.loop.ending = shell.rig.now, True
+    while not shell.loop._has_ended():
+        shell.cycles(1)
+    return shell.rig.now - began
+
+
+@example(5.0, True)
+@given(st.floats(0.1, 8.0), st.booleans())
+@settings(max_examples=10)
+def test_power_that_a_drive_keeps_at_the_end_is_told(stop_timeout: float, keeps: bool) -> None:
+    with ending_shell(CONFIG, stop_timeout=stop_timeout) as shell:
+        if keeps:
+            shell.rig.bus.faults.add(KEEPING)
+        assert end(shell) <= ending.stops_within(shell.rig.config.drives)
+        faults = [event.fault for event in shell.events() if event.fault is not None]
+        assert [(fault.cause, fault.drive) for fault in faults] == ([("timeout", "A")] if keeps else [])
+        assert shell.loop.control.measured.powered == keeps
+
+
+@given(st.floats(0.006, 10.0))
+@settings(max_examples=10)
+def test_a_controlled_stop_that_takes_too_long_at_the_end_becomes_a_quick_stop(deceleration: float) -> None:
+    """The quick stop has as much time as any other."""
+    config = msgspec.structs.replace(CONFIG, limits=msgspec.structs.replace(CONFIG.limits, platform=GENTLE))
+    with ending_shell(config, stop_timeout=8.0, quick_stop_deceleration=deceleration) as shell:
+        shell.send(2, "long", PoseGoal(0.12, 0.0, 0.0))
+        shell.cycles(350)
+        assert shell.mode() is Mode.MOVING
+        assert end(shell) > ending.MAX_SHUTDOWN_S
+        faults = [event for event in shell.events() if event.fault is not None]
+        assert [(event.event_code, event.params) for event in faults] == [(EventCode.SHUTDOWN_SLOW, {"timeout": 3.0})]
+        assert not shell.loop.control.measured.powered
 
 
 def test_who_enables_while_the_service_ends_moves_nothing(shell: Shell) -> None:

@@ -100,6 +100,24 @@ def test_a_service_recovers_without_a_restart(drives: tuple[Path, str, Tell], tm
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("drives", ["cia402"], indirect=True)
+def test_an_end_that_leaves_a_drive_with_power_is_a_failure(drives: tuple[Path, str, Tell], tmp_path: Path) -> None:
+    config, locator, tell = drives
+    config.write_text(config.read_text().replace("stop_timeout = 1.0", "stop_timeout = 4.0"))
+    with (tmp_path / "log").open("w+b") as log:
+        process = own_service.start(config, log, "--record", str(tmp_path / "session.rrd"))
+        with Robot(connect=locator) as robot:
+            robot.enable()
+        tell("A drop rpdo1 rpdo2 rpdo3 sdo-request nmt")
+        assert own_service.end(process) == 1
+        log.seek(0)
+        said = log.read().decode()
+    assert "trirail: the service has ended, but drive A is operation enabled according to the last statusword: " in said
+    assert "drive A: is operation enabled 4 s after disable" in said
+    assert "killing it" not in said  # it would be while it still removes the power
+
+
+@pytest.mark.long
 def test_a_service_that_starts_without_its_bus_is_in_fault_and_says_why(tmp_path: Path) -> None:
     config, locator = own_service.private(tmp_path)
     text = config.read_text()

@@ -6,6 +6,7 @@ import errno
 import itertools
 import os
 import random
+import socket
 import tempfile
 from collections import Counter
 from pathlib import Path
@@ -392,6 +393,29 @@ def test_an_end_while_a_recorder_is_started_again_is_in_order(run: Running, monk
         recorder_2="freeze()",
     )
     assert run.told[2:] == ["SIGTERM: stopping the robot and disabling the drives"]
+
+
+def test_a_loop_has_the_time_to_end_that_its_drives_have_to_stop(
+    run: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """systemd is told that the end takes so long."""
+    config = structs.replace(CONFIG, drives=structs.replace(CONFIG.drives, stop_timeout=100.0))
+    closing = "def end(*_): heartbeats.heart('loop').rest(); time.sleep(1.0); os._exit(0)\n"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told:
+        told.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        run.ends(
+            0,
+            config,
+            loop_1=f"{closing}signal.signal(signal.SIGTERM, end)\nready()\nbeat_until(lambda: begun('up'))\n"
+            f"os.kill({os.getpid()}, signal.SIGTERM)\nbeat_until(never)",
+            gateway_1=SERVING,
+            recorder_1="ready()\nbeat_until(lambda: begun('serving') and loop_gone())\nos._exit(0)",
+        )
+        while not (state := told.recv(1000).decode()).startswith("STOPPING=1\n"):
+            pass
+    assert run.told[1:] == ["SIGTERM: stopping the robot and disabling the drives"]
+    assert int(state.partition("EXTEND_TIMEOUT_USEC=")[2]) > 200e6
 
 
 @pytest.mark.usefixtures("patient")

@@ -99,10 +99,10 @@ def _timed_out(now: CommandProgress) -> str:
 
 def powered_message(measured: MeasuredState, latched: str | None) -> str:
     """Return the refusal of a reset that is sent while drives can still move. The message names these drives."""
-    return f"{_powered_drives(measured)}: send reset again when the drives are at rest (fault: {latched})"
+    return f"{powered_drives(measured)}: send reset again when the drives are at rest (fault: {latched})"
 
 
-def _powered_drives(measured: MeasuredState) -> str:
+def powered_drives(measured: MeasuredState) -> str:
     """Return the names and states of the drives that can still move."""
     states = zip(NAMES, measured.feedback.state, strict=True)
     drives = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
@@ -163,7 +163,7 @@ class Commands:
             event = ModeEvent.STOP
         action = self._modes.check(event).action
         if action is Action.POWER_UP and self._measured.powered:
-            words = f"{_powered_drives(self._measured)}: send enable again when no drive has power"
+            words = f"{powered_drives(self._measured)}: send enable again when no drive has power"
             raise RefusedError(RefusalCode.STOPPING, words)
         if action is Action.POWER_UP:
             self._setpoints.check_rest()

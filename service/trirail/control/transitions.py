@@ -18,7 +18,7 @@ from trirail.motion.schedule import Schedule
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import FaultDetail, Notice, Outcome
 from trirail.wire.packets import GoalRequest
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, FaultCause, Mode
 
 _OUTCOMES: dict[ModeEvent, Outcome] = {
     ModeEvent.STANDSTILL: "done",
@@ -137,7 +137,12 @@ class Transitions:
             self._planner.discard_rate_change()
 
     def handle_disturbance(self, event: ModeEvent, reason: EventText) -> None:
-        """Handle the loss of the gateway, a series of late ticks, or the shutdown of the service."""
+        """Handle the loss of the gateway, a series of late ticks, or the shutdown of the service, which may end with a
+        quick stop.
+        """
+        if event is ModeEvent.QUICK_STOP:
+            self.trip(reason, FaultCause.QUICK_STOP)
+            return
         decided = step(self.state, event)
         changes = not isinstance(decided, Refusal) and decided.state != self.state
         # Missed ticks are reported even if the robot is already at rest with power, since a motion would have stopped.

@@ -14,6 +14,7 @@ from trirail.config import Config
 from trirail.control.control import Control, TimedInput
 from trirail.control.modes import ModeEvent
 from trirail.processes.clock import Overruns, PollSet, Suspensions, Tick, Ticker
+from trirail.processes.ending import MAX_SHUTDOWN_S, stops_within
 from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
 from trirail.processes.quiet import MOST_AHEAD, Reached
@@ -40,11 +41,6 @@ BUDGET_DECAY = 1 / 32
 """Fraction by which the budget shrinks each time a decision takes less time than the budget."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
 """Minimum time-out for the gateway's heartbeat, in cycles."""
-MAX_SHUTDOWN_S = 3.0
-"""Maximum duration of the controlled stop when the service ends [s].
-
-After this time the loop ends, and the drives stop by themselves.
-"""
 
 _STILL_IN_USE = (Mode.ENABLING, Mode.HOMING, Mode.HOLDING, Mode.MOVING)
 """Modes in which a robot is only if a request arrived after the end of the service was announced."""
@@ -112,6 +108,7 @@ class Loop:
         self.ending = False
         """Set this to True from outside to make the loop stop the robot, disable the drives and return."""
         self._ending_since: int | None = None
+        self._stops_within = stops_within(config.drives)
         self._overruns = Overruns(config.watchdogs.max_overruns)
         self._heart = heartbeats.heart("loop")
         self._urgent_flag = UrgentFlag(heartbeats)
@@ -130,7 +127,7 @@ class Loop:
         self._parts_ns: MutableSequence[int] = [0] * len(Part) if self._quiet is None else self._quiet.parts_ns
 
     def run(self, ticker: Ticker) -> None:
-        """Run cycles until `ending` is set, and then until the drives are unpowered or MAX_SHUTDOWN_S has passed."""
+        """Run cycles until `ending` is set, and then until the drives have lost power or report that they keep it."""
         self.begin()
         while not self._has_ended():
             self.turn(ticker)
@@ -405,13 +402,24 @@ class Loop:
             self._ending_since = self._ending_since or self.control.cycles
             end = coded("the service is ending: controlled stop, drives disabled", EventCode.SHUTDOWN)
             yield Disturbance(ModeEvent.SHUTDOWN.name, end.text, **end.fields)
+        elif self.control.state.mode is Mode.STOPPING and self._ending_for > MAX_SHUTDOWN_S:
+            words = f"the service is ending: not stopped within {MAX_SHUTDOWN_S:g} s, so the drives quick-stop"
+            slow = coded(words, EventCode.SHUTDOWN_SLOW, timeout=MAX_SHUTDOWN_S)
+            yield Disturbance(ModeEvent.QUICK_STOP.name, slow.text, **slow.fields)
+
+    @property
+    def _ending_for(self) -> float:
+        """Time since the end of the service was announced [s]; 0 before."""
+        return (self.control.cycles - self._ending_since) * self._period if self._ending_since is not None else 0.0
 
     def _has_ended(self) -> bool:
         if self._ending_since is None:
             return False
-        control = self.control
-        stands = control.state.mode in (Mode.DISABLED, Mode.FAULT) and not control.measured.powered
-        return stands or (control.cycles - self._ending_since) * self._period > MAX_SHUTDOWN_S
+        measured = self.control.measured
+        if not measured.powered:
+            return self.control.state.mode in (Mode.DISABLED, Mode.FAULT)
+        fault = measured.feedback.fault
+        return (fault is not None and fault.cause == "timeout") or self._ending_for > self._stops_within
 
     def _flush(self) -> None:
         """Count a heartbeat, send the batch of records, and accept processes that want to connect."""

@@ -25,6 +25,8 @@ from trirail_drivers.interface import NAMES, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config
+from trirail.control.commands import powered_drives
+from trirail.errors import ServiceError
 from trirail.kinematics.robot import warm_up
 from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes import realtime
@@ -205,7 +207,7 @@ def main(
     heartbeats: Heartbeats,
     ready: Callable[[object], None],
 ) -> int:
-    """Run the loop process; return its exit code.
+    """Run the loop process; return its exit code. Raises ServiceError if a drive has kept its power at the end.
 
     Parameters
     ----------
@@ -245,4 +247,6 @@ def main(
                 port.send(message(Farewell()))
         for port in ports:
             port.close()
+    if loop.control.measured.powered:
+        raise ServiceError(f"the service has ended, but {powered_drives(loop.control.measured)}: switch off the supply")
     return 0

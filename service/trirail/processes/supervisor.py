@@ -17,6 +17,7 @@ from trirail_drivers import files
 from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.processes.compiling import Progress
+from trirail.processes.ending import loop_ends_within
 from trirail.processes.forked_processes import ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
 from trirail.processes.monitoring import MIN_SILENT_CYCLES, Health, Running
@@ -54,7 +55,8 @@ START_WITHIN = 300.0
 FORKS_WITHIN = 5.0
 """Maximum time for the fork server to fork a child when the service has started [s]."""
 END_WITHIN = 6.0
-"""Maximum time for processes to end before they are killed [s]."""
+"""Maximum time for processes to end before they are killed [s]. The loop may need longer, see ending.loop_ends_within.
+"""
 RESTART_DURING_START = 1.0
 """Pause before the restart of a process that has ended during the start of the service [s].
 
@@ -133,6 +135,7 @@ class Supervisor:
         self._ending = False
         self._failed = False
         self._loop_has_run = False
+        self._loop_ends_within = max(END_WITHIN, loop_ends_within(config.drives))
         self._up = False
 
     def run(
@@ -349,14 +352,16 @@ class Supervisor:
 
     def _end(self) -> None:
         """End the loop first, so that the gateway and the recorder can report its end. Then end the other processes."""
-        notify("STOPPING=1")
+        # First the loop ends, then the others by themselves, then the others after SIGTERM, then those that are killed.
+        ends_within = self._loop_ends_within + 3.0 * END_WITHIN
+        notify(f"STOPPING=1\nEXTEND_TIMEOUT_USEC={ends_within * 1e6:.0f}")
         self._health.end({name: self._running(name) for name in self._names})
         for child in self._children.values():
             if child.pid is None:
                 child.kill()
         if loop := self._children.get("loop"):
             loop.send_signal(signal.SIGTERM)
-            if not loop.wait(time.monotonic() + END_WITHIN):
+            if not loop.wait(time.monotonic() + self._loop_ends_within):
                 self._kill_unresponsive(loop)
             self._loop_has_run = self._loop_has_run or loop.ready_message is not None
         for name in ("planner", "drives"):  # killed, because they have no state and may be frozen or still starting

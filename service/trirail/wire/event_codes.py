@@ -66,6 +66,7 @@ class EventCode(StrEnum):
     GATEWAY_LOST = "gateway_lost", "the gateway's process has died"
     GATEWAY_FROZEN = "gateway_frozen", "the gateway's process hangs", "timeout"
     SHUTDOWN = "shutdown", "the service is ending"
+    SHUTDOWN_SLOW = "shutdown_slow", "the controlled stop at the service's end took too long: quick stop", "timeout"
 
     # Drives.
     DRIVE_WARNING = "drive_warning", "a warning of the drives or their bus", "warning"

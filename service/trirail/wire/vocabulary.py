@@ -39,7 +39,7 @@ class FaultCause(StrEnum):
     PLACE = "place"
     """The slider positions do not correspond to any pose, or correspond to a pose at which the robot must not be."""
     QUICK_STOP = "quick_stop"
-    """A user sent quick_stop."""
+    """A user sent quick_stop, or the controlled stop at the end of the service took too long."""
     LOOP = "loop"
     """The loop has died or hung."""
     INTERNAL = "internal"
