@@ -35,7 +35,6 @@ from trirail.wire.packets import (
     CommandDone,
     CommandRequest,
     EventReport,
-    Farewell,
     GoalRequest,
     Refused,
     Request,
@@ -516,15 +515,16 @@ class EndedLoop(FakeLink):
 
 
 def test_what_the_loop_said_before_it_ended_is_heard_though_it_takes_nothing_any_more(tmp_path: Path) -> None:
-    """Else a loop that ended as it should would be told to have died."""
-    accepted, ended = (packets.message(said) for said in (Accepted(1, GoalReply("g", 1.0)), Farewell()))
+    event = Notice("service", "info", "said last").event(1, 0.0, 1, 0.0)
+    accepted, ended = (packets.message(said) for said in (Accepted(1, GoalReply("g", 1.0)), EventReport(event)))
     unreadable = bytes([packets.Kind.MESSAGE]) + b"\xc1"
     told: list[Event] = []
     with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
         link = EndedLoop(accepted, unreadable, accepted, ended)
-        gateway = Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG), told.append)  # type: ignore[arg-type]
+        given = link, lambda: None, opened, Guard(CONFIG), told.append
+        gateway = Gateway(CONFIG, *given, last_cycle=lambda: 1)  # type: ignore[arg-type]
         gateway.serve(lambda: None)
-    assert told == []
+    assert told == [event]
 
 
 class BusyLoop(EndedLoop):

@@ -667,7 +667,9 @@ class Asking:
     def __init__(self, shell: Shell) -> None:
         self.shell = shell
         self.answered: dict[str, Any] = {}
-        self.requests = Requests(CONFIG, shell.gateway, Guard(CONFIG), self, LoopDeath(CONFIG.period), nullcontext)  # type: ignore[arg-type]
+        self.requests = Requests(
+            CONFIG, shell.gateway, Guard(CONFIG), self, LoopDeath(CONFIG.period, lambda: None), nullcontext
+        )  # type: ignore[arg-type]
 
     def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
         self.answered[incoming.id] = content

@@ -6,10 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rigs import Clock
+from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.loop_death import LoopDeath
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
-from trirail.wire.packets import ControlInput, EventReport, Farewell, GoalRequest, Status
+from trirail.wire.packets import ControlInput, EventReport, GoalRequest, Status
+
+
+def alive() -> None:
+    """Return that the loop has not ended."""
 
 
 def request(goal_id: str) -> GoalRequest:
@@ -25,7 +30,7 @@ def ended(seq: int, goal_id: str) -> EventReport:
 )
 def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
     clock = Clock()
-    words = LoopDeath(0.001, clock)
+    words = LoopDeath(0.001, alive, clock)
     words.record_activity()
     words.follow(ended(7, "before"))
     words.follow(ControlInput(1, 3, 0, request("g-1")))
@@ -43,22 +48,30 @@ def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
 
 def test_a_slow_loop_is_not_taken_for_frozen() -> None:
     clock = Clock()
-    words = LoopDeath(1.0, clock)
+    words = LoopDeath(1.0, alive, clock)
     words.record_activity()
     clock.now += 1.0
     assert "has died" in str(words.reason)
 
 
-def test_nothing_is_added_to_an_end_as_it_should_be() -> None:
-    words = LoopDeath(0.001)
+@given(st.integers(1, 5000), st.integers(0, 5000))
+def test_an_end_as_it_should_be_is_told_of_only_where_its_last_cycles_are_missing(cycle: int, missing: int) -> None:
+    heartbeats = Heartbeats.create()
+    words = LoopDeath(0.001, heartbeats.last_cycle)
     words.record_activity()
     words.follow(request("g-1"))
-    words.follow(Farewell())
-    assert (words.reason, words.events(1)) == (None, [])
+    assert words.reason is not None
+    assert words.missing_cycles(cycle) == []
+    heartbeats.record_end(cycle + missing)
+    assert words.reason is None
+    assert words.events(cycle) == []
+    told = [(event.seq, event.level, event.cycle, event.params) for event in words.missing_cycles(cycle)]
+    lacks = {"lost": 0.0, "skipped": 0.0, "absent": float(missing)}
+    assert told == ([(1, "warning", cycle + missing + 1, lacks)] if missing else [])
 
 
 def test_a_loop_that_never_turned_says_by_itself_why() -> None:
-    assert LoopDeath(0.001).events(0) == []
+    assert LoopDeath(0.001, alive).events(0) == []
 
 
 IDS = st.sampled_from("abcd")
@@ -66,7 +79,7 @@ IDS = st.sampled_from("abcd")
 
 @given(st.lists(st.tuples(st.sampled_from(["asked", "under way", "ended"]), IDS)))
 def test_every_goal_ends_once(history: list[tuple[str, str]]) -> None:
-    words = LoopDeath(0.001)
+    words = LoopDeath(0.001, alive)
     words.record_activity()
     begun: set[str] = set()
     over: set[str] = set()

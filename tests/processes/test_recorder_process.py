@@ -7,6 +7,7 @@ import socket
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import made
@@ -14,6 +15,9 @@ import msgspec
 import numpy as np
 import pytest
 from control_rig import CONFIG
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trirail.analysis.summary import summarise
 from trirail.config import Config
 from trirail.processes import recording
 from trirail.processes.heartbeats import Heartbeats
@@ -80,6 +84,25 @@ def test_the_recorder_saves_while_packets_keep_arriving(tmp_path: Path, monkeypa
     (file,) = tmp_path.glob("demo-*.rrd")
     assert read(file).records["cycle"].tolist() == [*range(1, 1001)]
     assert np.diff([0, *saved_at, 1000]).max() <= PACKETS_PER_TURN
+
+
+@given(st.integers(1, 100), st.integers(0, 5000))
+@settings(max_examples=10)
+def test_the_last_cycles_that_a_slow_recorder_misses_are_no_fault_but_missing(received: int, missing: int) -> None:
+    """The end itself needs no space at the recorder's socket."""
+    ours, loops = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with TemporaryDirectory() as folder, ours, loops:
+        loops.send(bytes([Kind.RECORDS]) + made.records(3.0)[1 : 1 + received].tobytes())
+        loops.close()
+        heartbeats = Heartbeats.create()
+        heartbeats.record_end(received + missing)
+        given = PacketLink(ours), heartbeats.heart("recorder"), lambda _: None, lambda _: None, heartbeats.last_cycle
+        assert recording.main(config_in(Path(folder)), None, *given) == 0
+        (file,) = Path(folder).glob("*.rrd")  # no black box
+        summed = summarise(read(file))
+    assert (summed.cycles, summed.lacking, summed.faults) == (received, missing, [])
+    words = f"missing data: the last {missing} cycles (recorder too slow)"
+    assert [each.message for each in summed.warnings] == ([words] if missing else [])
 
 
 def test_a_black_box_has_the_times_of_the_moment_though_the_clock_was_set(

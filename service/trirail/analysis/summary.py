@@ -14,6 +14,7 @@ from trirail.naming import Labels
 from trirail.telemetry import provenance
 from trirail.telemetry.journal import Line
 from trirail.telemetry.recording import RecordedAlignment, Recording
+from trirail.wire.event_codes import EventCode
 from trirail.wire.goals import kind_name
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, GoalRequest
@@ -99,7 +100,7 @@ class Summary(msgspec.Struct, frozen=True):
     """Time from the first to the last record [s]."""
     cycles: int
     lacking: int
-    """Number of cycles between the first and the last record that have no record."""
+    """Number of cycles from the first record to the end of the recording that have no record."""
     missed: int
     """Number of ticks that the loop missed."""
     rate_hz: int
@@ -131,7 +132,7 @@ def summarise(recording: Recording) -> Summary:
     records = recording.records
     period = _period(recording)
     cycles = records["cycle"]
-    lacking = int(cycles[-1] - cycles[0]) + 1 - len(records)
+    lacking = _last_cycle(recording) - int(cycles[0]) + 1 - len(records)
     software = provenance.recorded_by(recording.texts)
     modes, counts = np.unique(records["mode"], return_counts=True)
     return Summary(
@@ -254,6 +255,15 @@ def _alignment(recorded: RecordedAlignment) -> AlignmentSummary:
         corrections,
         rows,
     )
+
+
+def _last_cycle(recording: Recording) -> int:
+    """Return the last cycle of a recording, which has no record if an event reports that the last ones are missing."""
+    last = int(recording.records["cycle"][-1])
+    for event in (line.event for line in recording.events):
+        if event is not None and event.event_code is EventCode.RECORDING_INCOMPLETE:
+            last = max(last, event.cycle - 1)
+    return last
 
 
 def _incident(line: Line) -> Incident:

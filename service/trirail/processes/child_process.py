@@ -146,13 +146,13 @@ def _run(child: Child) -> int:
     if name == "gateway":
         from trirail.processes import gateway as gate
 
-        order, urgent_section = child.order, child.heartbeats.urgent_section
-        return gate.main(
-            order, link, heart.beat, child.report_ready, child.log, child.report_measurements, urgent_section
-        )
+        shared = child.heartbeats.urgent_section, child.heartbeats.last_cycle
+        reports = child.report_ready, child.log, child.report_measurements
+        return gate.main(child.order, link, heart.beat, *reports, *shared)
     from trirail.processes import recording
 
-    return recording.main(config, child.order.record, link, heart, child.report_ready, child.report_measurements)
+    reported = child.report_ready, child.report_measurements, child.heartbeats.last_cycle
+    return recording.main(config, child.order.record, link, heart, *reported)
 
 
 def _plan(child: Child) -> int:

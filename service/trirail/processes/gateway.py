@@ -82,6 +82,7 @@ class Gateway:
         log: Callable[[Event], None] = lambda _: None,
         report_measurements: Callable[[msgspec.Struct], None] = lambda _: None,
         urgent_section: Callable[[], AbstractContextManager[None]] = nullcontext,
+        last_cycle: Callable[[], int | None] = lambda: None,
         *,
         again: bool = False,
         run: str = "unnamed",
@@ -94,7 +95,7 @@ class Gateway:
         self._link = link
         self._beat = beat
         self._guard = guard
-        self._loop_death = LoopDeath(config.period)
+        self._loop_death = LoopDeath(config.period, last_cycle)
         self._info = info(config)
         self._welcomed = False
         """True once the loop has sent its welcome. Clients are served from then on."""
@@ -341,7 +342,7 @@ class Gateway:
         self._log(event)
 
     def _handle_last_packets(self, ready: Callable[[], None]) -> None:
-        """Handle the last messages of the loop, which may include its farewell."""
+        """Handle the last messages of the loop."""
         with contextlib.suppress(LinkClosed):
             while (packet := self._link.receive()) is not None:
                 self._loop_death.record_activity()
@@ -349,7 +350,7 @@ class Gateway:
                     self._handle_packet(packet, ready)
 
     def _announce_loop_death(self) -> None:
-        """Publish the death of the loop as events and as a last state, unless the loop has sent its farewell."""
+        """Publish the death of the loop as events and as a last state, unless the loop has ended normally."""
         for event in self._loop_death.events(self._states.cycle):
             self._handle_event(event)
         if (reason := self._loop_death.reason) and self._states.cycle:
@@ -409,6 +410,7 @@ def main(
     log: Callable[[Event], None],
     report_measurements: Callable[[msgspec.Struct], None],
     urgent_section: Callable[[], AbstractContextManager[None]],
+    last_cycle: Callable[[], int | None],
 ) -> int:
     """Run the gateway process; return its exit code.
 
@@ -422,6 +424,8 @@ def main(
         Function called with the measurements once per second, if the configuration enables metrics.
     urgent_section
         Function that returns a context. The loop handles packets sent within it in the cycle in which they arrive.
+    last_cycle
+        Function that returns the loop's last cycle if the loop has ended normally, otherwise None.
 
     """
     sys.setswitchinterval(SWITCH_EVERY)
@@ -438,6 +442,7 @@ def main(
             log,
             report_measurements,
             urgent_section,
+            last_cycle,
             again=order.again,
             run=order.run,
         )

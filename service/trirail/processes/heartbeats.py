@@ -1,4 +1,4 @@
-"""Heartbeats and urgent requests, as counters in memory that the service's processes share, and detection of hangs.
+"""Heartbeats, urgent requests and the loop's end, as numbers in memory that the processes share; detection of hangs.
 
 Counting a beat and checking a counter each take 0.1 µs and never wait. Unlike packets, counters do not fill a buffer
 while a process is frozen. Each process counts its beats in the thread that does its work, so that a hung process stops
@@ -25,6 +25,8 @@ PROCESSES = ("loop", "gateway", "planner", "recorder")
 """Processes with a heartbeat in shared memory. The simulated drives send heartbeats on their bus instead."""
 URGENT_INDEX = len(PROCESSES)
 """Index of the counter of urgent requests."""
+END_INDEX = URGENT_INDEX + 1
+"""Index of the number of cycles after which the loop has ended normally; 0 if it has not."""
 BEAT_EVERY = 0.05
 """Maximum interval between two beats of a process, also while the process is idle [s]."""
 
@@ -40,7 +42,7 @@ class Heartbeats:
 
     @property
     def counts(self) -> memoryview[int]:
-        """All counters: those of the processes, in the order of PROCESSES, then the counter of urgent requests."""
+        """All numbers: the processes' counters in the order of PROCESSES, then those at URGENT_INDEX and END_INDEX."""
         return self._counts
 
     @classmethod
@@ -60,6 +62,14 @@ class Heartbeats:
     def heart(self, process: str) -> Heart:
         """Return the heartbeat counter of a process in PROCESSES."""
         return Heart(self._counts, PROCESSES.index(process))
+
+    def record_end(self, cycle: int) -> None:
+        """Record that the loop ends normally after cycle `cycle`. A packet could find no space at a slow peer."""
+        self._counts[END_INDEX] = cycle
+
+    def last_cycle(self) -> int | None:
+        """Return the last cycle of the loop if the loop has ended normally; otherwise None."""
+        return self._counts[END_INDEX] or None
 
     @contextmanager
     def urgent_section(self) -> Iterator[None]:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import REMEMBERED_IDS, Event, FaultDetail, Notice
-from trirail.wire.packets import Answer, ControlInput, EventReport, Farewell, GoalRequest, Status
+from trirail.wire.packets import Answer, ControlInput, EventReport, GoalRequest, Status
 from trirail.wire.vocabulary import FaultCause, Mode
 
 FROZEN, CYCLES = 0.5, 3
@@ -21,16 +21,21 @@ The larger of the two durations applies. A running loop sends records every 20 m
 
 
 class LoopDeath:
-    """Observer of the loop's messages, which derives the missing events if the loop dies."""
+    """Observer of the loop's messages, which derives the missing events if the loop dies.
 
-    def __init__(self, period: float, clock: Callable[[], float] = time.monotonic) -> None:
+    `last_cycle` returns the last cycle if the loop has ended normally, otherwise None.
+    """
+
+    def __init__(
+        self, period: float, last_cycle: Callable[[], int | None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._period = period
+        self._last_cycle = last_cycle
         self._clock = clock
         self._heard = clock()
         self._seq = 0
         self._open: dict[str, str | None] = {}
         self._ended: dict[str, None] = {}
-        self._farewell = False
         self._greeted = False
 
     def record_activity(self) -> None:
@@ -39,7 +44,7 @@ class LoopDeath:
         self._greeted = True
 
     def follow(self, message: Answer | GoalRequest) -> None:
-        """Track goals, events and the farewell, given a message from the loop or a goal that was sent to the loop."""
+        """Track goals and events, given a message from the loop or a goal that was sent to the loop."""
         match message:
             case ControlInput(given=GoalRequest() as request) | (GoalRequest() as request):
                 self._record_begin(request.id, request.user)
@@ -49,8 +54,6 @@ class LoopDeath:
                 self._seq = event.seq
                 if event.outcome is not None and event.id is not None:
                     self._record_end(event.id)
-            case Farewell():
-                self._farewell = True
 
     def is_open(self, goal_id: str) -> bool:
         """Return True if a goal with this id has begun and has not ended."""
@@ -68,8 +71,8 @@ class LoopDeath:
 
     @property
     def reason(self) -> EventText | None:
-        """Text for people with the cause of the loop's end; None if the loop ended with a farewell or never ran."""
-        if self._farewell or not self._greeted:
+        """Text for people with the cause of the loop's end; None if the loop ended normally or never ran."""
+        if not self._greeted or self._last_cycle() is not None:
             return None
         frozen = self._clock() - self._heard > max(FROZEN, CYCLES * self._period)
         how = "was frozen and has been killed" if frozen else "has died"
@@ -90,5 +93,20 @@ class LoopDeath:
             ended = {"outcome": "faulted", "reason": reason.text, **reason.fields}
             missing.append(Notice("goal", "error", words, id=goal_id, user=user, **ended))
         missing.append(Notice("mode", "info", f"{Mode.FAULT}: {reason}", mode=Mode.FAULT, **reason.fields))
+        return self._events(missing, cycle)
+
+    def missing_cycles(self, cycle: int) -> list[Event]:
+        """Return an event that reports the cycles between the last known cycle, `cycle`, and the loop's normal end.
+
+        The list is empty if there are none, or if no cycle is known.
+        """
+        last = self._last_cycle() or cycle
+        if last <= cycle or not cycle:
+            return []
+        words = f"missing data: the last {last - cycle} cycles (recorder too slow)"
+        text = coded(words, EventCode.RECORDING_INCOMPLETE, lost=0, skipped=0, absent=last - cycle)
+        return self._events([Notice("service", "warning", text.text, **text.fields)], last + 1)
+
+    def _events(self, notices: list[Notice], cycle: int) -> list[Event]:
         t, wall = cycle * self._period, time.time()
-        return [what.event(self._seq + n, t, cycle, wall) for n, what in enumerate(missing, 1)]
+        return [what.event(self._seq + n, t, cycle, wall) for n, what in enumerate(notices, 1)]

@@ -37,7 +37,7 @@ from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.goals import VelocityGoal
 from trirail.wire.links import PacketLink, Port
-from trirail.wire.packets import CommandRequest, Farewell, GoalRequest, Request, message
+from trirail.wire.packets import CommandRequest, GoalRequest, Request, message
 from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.vocabulary import Command, Mode
 
@@ -218,7 +218,7 @@ def main(
 
     """
     drives: DriveGroup | None = None
-    ended_normally = False
+    last_cycle = 0
     try:
         warm_up()
         unrehearsed = rehearse(config)
@@ -237,14 +237,12 @@ def main(
         signal.signal(signal.SIGTERM, end)
         ready({"lacking": lacking, "bus_load": drives.bus_load})
         loop.run(Ticker(round(config.period * 1e9), busy_wait_ns=config.loop.busy_wait_ns))
-        ended_normally = True
+        last_cycle = loop.control.cycles
     finally:
         heartbeats.heart("loop").rest()  # closing the drives may take longer than the time-out of the heartbeat
         if drives is not None:
             drives.close()
-        for port in (ports.gateway, ports.recorder):
-            if ended_normally:
-                port.send(message(Farewell()))
+        heartbeats.record_end(last_cycle)
         for port in ports:
             port.close()
     if loop.control.measured.powered:

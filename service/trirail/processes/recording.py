@@ -57,12 +57,19 @@ class Intake:
     It also sends notices to the loop, for example if data cannot be written.
     """
 
-    def __init__(self, config: Config, record: str | None, link: PacketLink, ready: Callable[[object], None]) -> None:
+    def __init__(
+        self,
+        config: Config,
+        record: str | None,
+        link: PacketLink,
+        ready: Callable[[object], None],
+        last_cycle: Callable[[], int | None] = lambda: None,
+    ) -> None:
         self._link = link
         self._ready = ready
         self._cycle = 0
         self._reported_unrecorded = ""
-        self._loop_death = LoopDeath(config.period)
+        self._loop_death = LoopDeath(config.period, last_cycle)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
         sidecars = path is None  # a user who names a single file does not expect further files next to it
@@ -98,8 +105,8 @@ class Intake:
             self._reported_unrecorded = what
 
     def loop_gone(self) -> None:
-        """Record the death of the loop as events, unless the loop has sent its farewell."""
-        for event in self._loop_death.events(self._cycle):
+        """Record as events that the loop has died or, if it ended normally, that its last cycles are missing."""
+        for event in (*self._loop_death.events(self._cycle), *self._loop_death.missing_cycles(self._cycle)):
             self._handle_answer(EventReport(event))
 
     def close(self) -> None:
@@ -159,10 +166,17 @@ def main(
     heart: Heart,
     ready: Callable[[object], None],
     report_measurements: Callable[[msgspec.Struct], None],
+    last_cycle: Callable[[], int | None] = lambda: None,
 ) -> int:
     """Run the recorder process until the loop disconnects or SIGTERM arrives; return the exit code.
 
-    `report_measurements` is called once per second, if the configuration enables metrics.
+    Parameters
+    ----------
+    report_measurements
+        Function called once per second, if the configuration enables metrics.
+    last_cycle
+        Function that returns the loop's last cycle if the loop has ended normally, otherwise None.
+
     """
     offer_to_oom_killer()  # a recorder that has ended is restarted, and the robot moves on
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
@@ -173,7 +187,7 @@ def main(
         ending = True
 
     signal.signal(signal.SIGTERM, end)  # before a file is created, which is deleted if the service does not start
-    intake = Intake(config, record, link, ready)
+    intake = Intake(config, record, link, ready, last_cycle)
     release_startup_memory()
     poll = select.poll()
     poll.register(link.fileno(), select.POLLIN)

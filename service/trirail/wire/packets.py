@@ -124,13 +124,6 @@ class EventReport(Struct, frozen=True, tag=True):
     event: Event
 
 
-class Farewell(Struct, frozen=True, tag=True):
-    """Message from the loop to the gateway and the recorder that the loop ends normally, with the drives disabled.
-
-    If a connection to the loop closes without this message, the loop has died.
-    """
-
-
 class Status(Struct, frozen=True, tag=True):
     """Message from the loop to the gateway and the recorder with values that records do not contain.
 
@@ -227,7 +220,7 @@ class Unrecorded(Struct, frozen=True, tag=True):
 
 
 RecorderMessage = Announcement | Unrecorded
-Answer = Accepted | Checked | CommandDone | Refused | Welcome | Farewell | EventReport | Status | ControlInput
+Answer = Accepted | Checked | CommandDone | Refused | Welcome | EventReport | Status | ControlInput
 
 prepare(Request, Answer, RecorderMessage, *(command.content for command in Command))
 encode = msgpack.Encoder().encode
