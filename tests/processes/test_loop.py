@@ -24,7 +24,7 @@ from trirail.processes.incoming import Incoming
 from trirail.processes.loop import Loop, TimeBudget
 from trirail.processes.loop_death import LoopDeath
 from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
-from trirail.processes.reports import BATCHES_PER_SECOND
+from trirail.processes.reports import BATCHES_PER_SECOND, SENT_AT_ONCE
 from trirail.processes.requests import MAX_COMMANDS, MAX_GOALS, Requests
 from trirail.processes.session_guard import Guard
 from trirail.wire import links
@@ -435,6 +435,33 @@ def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) 
     assert given[1].cycle == events["fault"].cycle
 
 
+@given(st.integers(0, 300), st.lists(st.integers(1, 20), max_size=20))
+@settings(max_examples=10)
+def test_a_restarted_gateway_gets_all_events_in_order_few_in_a_cycle(before: int, later: list[int]) -> None:
+    """Sending all of them in one cycle would delay the SYNCs that follow."""
+
+    def announce(number: int) -> None:
+        notices.extend(Notice("service", "info", "output switched") for _ in range(number))
+
+    with TemporaryDirectory() as folder, closing(Shell(Rig(), Path(folder))) as shell:
+        notices = shell.loop.control.ledger.notices
+        announce(before)
+        shell.cycles(2 + before // SENT_AT_ONCE)
+        shell.gateway.close()
+        shell.cycles(2)
+        shell.gateway = links.connect(shell.folder / "gateway")
+        told: list[int] = []
+        while later or not shell.loop._reports.idle or not told:
+            announce(later.pop() if later else 1 - min(1, len(told)))
+            shell.cycles(1)
+            new = [event.seq for event in shell.events()]
+            assert len(new) <= 2 * SENT_AT_ONCE  # after the setpoints, and after the decisions
+            told += new
+        assert told == list(range(1, len(told) + 1))
+        assert len(told) >= before
+    shell.rig.bus.shutdown()
+
+
 def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     shell.enabled()
     notice = message(Announcement(Notice("service", "warning", "the disk is full")))
@@ -667,9 +694,8 @@ class Asking:
     def __init__(self, shell: Shell) -> None:
         self.shell = shell
         self.answered: dict[str, Any] = {}
-        self.requests = Requests(
-            CONFIG, shell.gateway, Guard(CONFIG), self, LoopDeath(CONFIG.period, lambda: None), nullcontext
-        )  # type: ignore[arg-type]
+        loop_death = LoopDeath(CONFIG.period, lambda: None)
+        self.requests = Requests(CONFIG, shell.gateway, Guard(CONFIG), self, loop_death, nullcontext)  # type: ignore[arg-type]
 
     def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
         self.answered[incoming.id] = content

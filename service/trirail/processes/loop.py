@@ -19,7 +19,7 @@ from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
 from trirail.processes.quiet import MOST_AHEAD, Reached
 from trirail.processes.quiet_cycles import DecisionRequest, QuietCycles, QuietResult
-from trirail.processes.reports import Reports
+from trirail.processes.reports import EVENTS_KEPT, Reports
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.packets import (
     DecidedAhead,
@@ -131,7 +131,7 @@ class Loop:
         self.begin()
         while not self._has_ended():
             self.turn(ticker)
-        self._send_reports()
+        self._reports.pass_on(EVENTS_KEPT)
         self._flush()
 
     def begin(self) -> None:

@@ -36,7 +36,11 @@ from trirail.wire.text import quoted
 from trirail.wire.vocabulary import MODES
 
 BATCHES_PER_SECOND = 50
-ANSWERS_A_CYCLE = 8
+SENT_AT_ONCE = 8
+"""Maximum numbers of events and of answers that are sent to the gateway at once, so that no cycle becomes late.
+
+A restarted gateway is sent up to EVENTS_KEPT events.
+"""
 PROGRESS_EVERY = 0.1
 """Minimum interval between two progress reports while drives are being configured [s]."""
 INPUTS_KEPT = 8
@@ -148,19 +152,20 @@ class Reports:
         self._unsent_batch = self._batch[: 1 + self.batched * SIZE] if self.batched else None
         self._batch, self._spare, self.batched = self._spare, self._batch, 0
 
-    def pass_on(self) -> None:
-        """Send the inputs to the control, then the events and the answers, if there are any.
+    def pass_on(self, at_most: int = SENT_AT_ONCE) -> None:
+        """Send the inputs to the control, then at most `at_most` events and answers each, if there are any.
 
         The number of an event's cycle is that of the first cycle that shows its effect. This is the present cycle or,
         after the end of the present cycle, the next cycle.
         """
         if self._control.ledger.answers or self._control.ledger.notices or len(self._unsent_inputs) > INPUTS_KEPT:
             self._publish()
+        self._send_events(at_most)
         if self._answers:
-            self._send_answers()
+            self._send_answers(at_most)
 
     def flush(self) -> None:
-        """Send the batch of records and captured frames, accept new peers, and send events that have not been sent."""
+        """Send the batch of records and captured frames, and accept new peers."""
         self._send_inputs()
         if self._unsent_batch is None and self.batched:
             self.set_batch_aside()
@@ -177,7 +182,6 @@ class Reports:
         for unsent in tuple(self._unsent.values()):
             self._send_state(unsent)
         self.accept_peers()
-        self._send_events()
 
     def accept_peers(self) -> None:
         """Accept new connections of the gateway and the recorder, and send them the welcome and the status."""
@@ -238,7 +242,7 @@ class Reports:
         self._publish_status()
 
     def _publish(self) -> None:
-        """Send the inputs to the control, number and send the events, and enqueue the answers."""
+        """Send the inputs to the control, number the events, and enqueue the answers."""
         control, ledger = self._control, self._control.ledger
         self._send_inputs()
         cycle = control.modes.cycle
@@ -250,7 +254,6 @@ class Reports:
             self._recorder.send(packet)
         ledger.notices.clear()
         self._publish_status()
-        self._send_events()
         self._answers.extend(map(message, ledger.answers))
         ledger.answers.clear()
 
@@ -278,17 +281,19 @@ class Reports:
         if not self._gateway.send(message(state)) and self._gateway.connected:
             self._unsent[type(state)] = state
 
-    def _send_answers(self) -> None:
-        """Send at most ANSWERS_A_CYCLE answers. Answers wait for a slow gateway; if the gateway is lost, drop them."""
+    def _send_answers(self, at_most: int) -> None:
+        """Send at most `at_most` answers. Answers wait for a slow gateway; if the gateway is lost, drop them."""
         if not self._gateway.connected:
             self._answers.clear()
-        for _ in range(min(len(self._answers), ANSWERS_A_CYCLE)):
+        for _ in range(min(len(self._answers), at_most)):
             if not self._gateway.send(self._answers[0]):
                 return
             self._answers.popleft()
 
-    def _send_events(self) -> None:
-        """Send to the gateway all stored events that have not been sent to it."""
+    def _send_events(self, at_most: int) -> None:
+        """Send to the gateway at most `at_most` of the stored events that have not been sent to it."""
         self._sent_events = max(self._sent_events, self._events - len(self._kept))
-        while self._sent_events < self._events and self._gateway.send(self._kept[self._sent_events - self._events]):
+        for _ in range(min(self._events - self._sent_events, at_most)):
+            if not self._gateway.send(self._kept[self._sent_events - self._events]):
+                return
             self._sent_events += 1
