@@ -12,7 +12,7 @@ import pytest
 from alignment.cameras import Stage, camera, part_at
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.alignment.calibration_diff import ViewChange, compare_views
+from trirail.alignment.calibration_diff import ViewChange, compare_views, find_missing_views
 from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.images import LENSES, CameraView, Lens, Pair
 from trirail.alignment.procedure import StageMotion, calibrate_by_moves, calibration_moves, repeat_calibration
@@ -153,12 +153,14 @@ def test_deviations_are_those_of_many_trials(lens: Lens, other: Triple) -> None:
         assert scatter == pytest.approx(said, rel=0.2), name
 
 
-def test_views_that_are_in_one_alone_are_left_out() -> None:
+def test_views_that_are_in_one_alone_are_not_compared_and_lost_ones_are_named() -> None:
     rng = np.random.default_rng(1)
     views: dict[str, CameraView] = {name: camera(rng, place) for name, place in PART.items()}
     both = Stage(views, PART, rng).drive(calibrate_by_moves())
     one = Stage(views, {"left": PART["left"]}, rng).drive(calibrate_by_moves())
     assert [each.view for each in compare_views(both, one)] == ["left"]
+    assert find_missing_views(both, one) == ["right"]
+    assert find_missing_views(one, both) == []
 
 
 class LooseStage(Stage):

@@ -67,6 +67,12 @@ def compare_views(saved: CameraCalibration, current: CameraCalibration) -> list[
     ]
 
 
+def find_missing_views(saved: CameraCalibration, current: CameraCalibration) -> list[str]:
+    """Return the names of the views that show marks in the saved calibration, and none in the current one."""
+    before, now = ({mark.view for mark in each.marks.values()} for each in (saved, current))
+    return sorted(before - now)
+
+
 def _compare_view(saved: CameraCalibration, current: CameraCalibration, view: str) -> ViewChange:
     before, after = saved.views[view], current.views[view]
     at = np.array([to_base_frame(mark.place, current.poses[0]) for mark in current.marks.values() if mark.view == view])

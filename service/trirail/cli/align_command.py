@@ -169,7 +169,7 @@ def check(
 ) -> int:
     """Measure the part once without moving it; with --moves, check instead that no camera has moved.
 
-    Exit 1 if a camera has been shifted or turned.
+    Exit 1 if a camera has been shifted or turned, or if it shows none of its marks.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def check(
         Move to the poses of the calibration and back, with any part, and compare the cameras with their state at that
         time.
     """
-    from trirail.alignment.calibration_diff import compare_views
+    from trirail.alignment.calibration_diff import compare_views, find_missing_views
     from trirail.alignment.procedure import AlignmentTask, measure_part, repeat_calibration
     from trirail.client.alignment import drive
     from trirail.client.stage_geometry import geometry_id
@@ -194,15 +194,16 @@ def check(
             again = repeat_calibration(kept.calibration, source.looks)
             progress = _with_progress(again, service, len(kept.calibration.poses))
             now = drive(robot, look, progress, source.speed, source.wait)
-            changes = compare_views(kept.calibration, now)
+            changes, missing = compare_views(kept.calibration, now), find_missing_views(kept.calibration, now)
         else:
             measurement = drive(robot, look, measure_part(task), source.speed, source.wait)
     if moves:
         if service.json:
-            terminal.json({"views": [msgspec.to_builtins(each) | {"changed": each.is_changed} for each in changes]})
+            views = [msgspec.to_builtins(each) | {"changed": each.is_changed} for each in changes]
+            terminal.json({"views": views, "missing": missing})
         else:
-            alignment_lines.show_changes(changes)
-        return 1 if any(each.is_changed for each in changes) else 0
+            alignment_lines.show_changes(changes, missing)
+        return 1 if missing or any(each.is_changed for each in changes) else 0
     if service.json:
         terminal.json(msgspec.to_builtins(measurement))
     else:

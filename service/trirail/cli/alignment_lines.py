@@ -101,8 +101,8 @@ def _labelled(name: str, labels: Sequence[str]) -> str:
     return f"{labels[NAMES.index(leg)]} {parameter}"
 
 
-def show_changes(changes: Iterable[ViewChange]) -> None:
-    """Print how much each camera has moved since it was calibrated."""
+def show_changes(changes: Iterable[ViewChange], missing: Iterable[str]) -> None:
+    """Print how much each camera has moved since it was calibrated, and the views without marks."""
     for each in changes:
         (x, y), (dx, dy) = each.shift, each.shift_deviation
         verdict = "[red]was moved: calibrate again[/]" if each.is_changed else "as it was"
@@ -110,6 +110,12 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
             f"view {terminal.plain(each.view)}: {verdict}; shifted by x {x * 1e6:.0f} ± {dx * 1e6:.0f} µm, "
             f"y {y * 1e6:.0f} ± {dy * 1e6:.0f} µm, turned by {each.turn * 1e3:.2f} ± "
             f"{each.deviation * 1e3:.2f} mrad, scale {each.scale * 1e6:+.0f} ± {each.scale_deviation * 1e6:.0f} ppm",
+            soft_wrap=True,
+        )
+    for view in missing:
+        terminal.out.print(
+            f"view {terminal.plain(view)}: [red]none of its marks was found[/]; check light and part, or calibrate "
+            "again if the camera was moved",
             soft_wrap=True,
         )
 
