@@ -64,6 +64,10 @@ class Stage:
         """Give the looks from now on other noise."""
         self._rng = np.random.default_rng(seed)
 
+    def end_noise(self) -> None:
+        """Give the looks from now on no noise."""
+        self._noise = dict.fromkeys(self.part, 0.0)
+
     @property
     def true_pose(self) -> Triple:
         """Where the table is."""

@@ -155,6 +155,33 @@ def test_lost_swapped_and_wrong_marks_are_named_and_change_nothing(seed: int, na
     assert misses(made, found, unseen(task, 10)).max() < 1.5
 
 
+@settings(max_examples=6)  # each is a whole calibration of the stage
+@given(
+    name=names,
+    seed=SEEDS,
+    off=st.sampled_from(((5e-4, 2e-3, 0.0), (1e-3, 5e-3, 0.0), (50e-6, 1e-4, 1e-3))),
+)
+@example(name="uvw-ppr", seed=10, off=(1e-3, 5e-3, 0.0))
+@example(name="uvw", seed=107, off=(50e-6, 1e-4, 2e-3))
+@example(name="xxy", seed=11, off=(50e-6, 1e-4, 2e-3))
+def test_legs_far_from_their_configuration_leave_no_more_than_the_noise_of_the_pictures(
+    name: str, seed: int, off: tuple[float, float, float]
+) -> None:
+    """Legs or home positions that are several standard deviations off their drawings."""
+    place, angle, home = off
+    made, task = stage(name, seed, noise=0.05)
+    rng = np.random.default_rng(seed)
+    built = built_otherwise(task.start, rng, place, angle)
+    made.built = dataclasses.replace(
+        built,
+        legs=tuple(dataclasses.replace(leg, home=leg.home + rng.choice((-1.0, 1.0)) * home) for leg in built.legs),
+    )
+    found = made.drive(calibrate_geometry(task._replace(looks=4)))
+    assert not found.is_systematic
+    made.end_noise()
+    assert misses(made, found, unseen(task, 40)).max() < 0.2
+
+
 def test_what_no_look_tells_is_named_and_stays_as_configured() -> None:
     """The rail's angle of a leg whose cross slide is square to it, and its encoder's scale, have the same effect."""
     made, task = stage("uvw-ppr", 2, noise=0.05)

@@ -3,11 +3,13 @@
 The noise is estimated from the median of the residuals. A first fit with a robust loss function (soft l1; Triggs et al.
 2000, Bundle Adjustment, 4.3) finds the outliers. The last fit is a least-squares fit without the outliers. In both
 fits, the drawings are treated as an additional observation of each correction, with the standard deviations
-StageModel.doubts.
+StageModel.doubts. If the corrections are greater on average, these standard deviations are increased to their root mean
+square: a stage that was homed 1 mm off would otherwise be held back, and would look as if no geometry explained it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,7 +26,10 @@ MIN_NOISE_PX = 0.01
 MAX_OUTLIER_SHARE = 0.3
 TOLERANCE = 1e-12
 MAX_EVALUATIONS = 100
-MAX_ROUNDS = 6
+MAX_ROUNDS = 30
+MIN_NOISE_SHARE = 0.9
+"""Fraction of the noise in the round before, below which the noise still falls. The fit is then not finished: a lower
+noise gives the looks a greater weight against the drawings."""
 RAYLEIGH_MEDIAN = 1.1774
 """Median of the distance of normally distributed points from their mean in the plane, in standard deviations of one
 coordinate."""
@@ -51,8 +56,8 @@ def fit_stage(
 ) -> StageFit:
     """Fit a model to looks, starting from the configured stage or from the unknowns `start`.
 
-    If `fixed_legs` is set, only cameras and marks are fitted. Raises AlignmentError if there are too few looks, or if
-    the marks do not follow the moves.
+    If `fixed_legs` is set, only cameras and marks are fitted. Raises AlignmentError if there are too few looks, if the
+    marks do not follow the moves, or if the fit does not converge.
     """
     marks = list_marks(looks)
     unknowns = model.initial() if start is None else start
@@ -63,11 +68,13 @@ def fit_stage(
         )
     if fixed_legs:  # with wrong legs, correct observations could appear as outliers: use all observations
         free = np.eye(model.size)[:, model.legs :]
-        return _result(model, looks, _minimise(model, looks, unknowns, used, free, 1.0, robust=False), used, free)
-    unknowns = _minimise(model, looks, unknowns, used, np.eye(model.size), 1.0, robust=True)
+        unknowns = _minimise(model, looks, unknowns, used, free, 1.0, 1.0, robust=False)
+        return _result(model, looks, unknowns, used, free, 1.0)
+    unknowns = _minimise(model, looks, unknowns, used, np.eye(model.size), 1.0, 1.0, robust=True)
+    noise = math.inf
     for _ in range(MAX_ROUNDS):
         away = np.linalg.norm(model.residuals(unknowns, looks), axis=1)
-        noise = max(float(np.median(away[used])) / RAYLEIGH_MEDIAN, MIN_NOISE_PX)
+        last, noise = noise, max(float(np.median(away[used])) / RAYLEIGH_MEDIAN, MIN_NOISE_PX)
         now = away <= OUTLIER_DEVIATIONS * noise
         if now.mean() < 1.0 - MAX_OUTLIER_SHARE:
             raise AlignmentError(
@@ -75,24 +82,32 @@ def fit_stage(
                 f"{len(now) - int(now.sum())} of {len(now)} marks are far from where any stage would put them; check "
                 "that each look takes a new picture, and the names of the marks",
             )
-        basis = _determined(model, model.jacobian(unknowns, looks)[now] / noise)
+        doubt = max(1.0, float(np.sqrt(np.mean(unknowns[: model.legs] ** 2))))
+        basis = _determined(model, model.jacobian(unknowns, looks)[now] / noise * doubt)
         unknowns[: model.legs] = basis[: model.legs] @ (basis[: model.legs].T @ unknowns[: model.legs])
-        settled, used = bool(np.array_equal(now, used)), now
-        unknowns = _minimise(model, looks, unknowns, used, basis, noise, robust=False)
-        if settled:
+        is_falling, is_same = noise < MIN_NOISE_SHARE * last, np.array_equal(now, used)
+        used = now
+        unknowns = _minimise(model, looks, unknowns, used, basis, noise, doubt, robust=False)
+        if is_same and not is_falling:
             break
-    return _result(model, looks, unknowns, used, basis)
+    if is_falling:
+        raise AlignmentError(
+            AlignmentFault.MOVES,
+            f"the fit of the geometry did not converge in {MAX_ROUNDS} rounds, the noise still falls at {noise:.2f} "
+            "pixels; check the configured geometry against drawings and homing, or add looks",
+        )
+    return _result(model, looks, unknowns, used, basis, doubt)
 
 
 def _result(
-    model: StageModel, looks: Sequence[StageLook], unknowns: Floats, used: NDArray[np.bool], basis: Floats
+    model: StageModel, looks: Sequence[StageLook], unknowns: Floats, used: NDArray[np.bool], basis: Floats, doubt: float
 ) -> StageFit:
     residuals = model.residuals(unknowns, looks)
     jacobian = model.jacobian(unknowns, looks)[used].reshape(-1, model.size) @ basis
     legs = model.legs
     freedom = max(2 * int(used.sum()) - basis.shape[1], 1)
     noise = float(np.sqrt((residuals[used] ** 2).sum() / freedom))
-    information = np.concatenate([jacobian, noise * np.eye(legs, model.size) @ basis])  # with the drawings
+    information = np.concatenate([jacobian, noise / doubt * np.eye(legs, model.size) @ basis])  # with the drawings
     scales = np.maximum(np.linalg.norm(information, axis=0), 1e-300)
     inverse = np.linalg.pinv(information / scales)
     covariance = basis @ ((inverse @ inverse.T) / np.outer(scales, scales)) @ basis.T * noise**2
@@ -128,21 +143,23 @@ def _minimise(
     used: NDArray[np.bool],
     basis: Floats,
     noise: float,
+    doubt: float,
     *,
     robust: bool,
 ) -> Floats:
+    """Return the unknowns at the least squares. The doubts of the drawings are multiplied by `doubt`."""
     from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
     # The drawings are an additional observation of each correction. Otherwise, the noise of a small number of looks
     # would cause large corrections of the legs.
-    prior = np.eye(model.legs, model.size) @ basis
+    prior = np.eye(model.legs, model.size) @ basis / doubt
 
     def residuals(step: Floats) -> Floats:
         try:
             seen = model.residuals(unknowns + basis @ step, looks)[used].ravel() / noise
         except KinematicsError:
             return np.full(2 * int(used.sum()) + len(prior), np.inf)  # the solver will shorten the step
-        return np.concatenate([seen, unknowns[: model.legs] + prior @ step])
+        return np.concatenate([seen, unknowns[: model.legs] / doubt + prior @ step])
 
     def jacobian(step: Floats) -> Floats:
         rows = model.jacobian(unknowns + basis @ step, looks)[used].reshape(-1, model.size) @ basis / noise
