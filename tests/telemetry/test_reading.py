@@ -25,7 +25,7 @@ from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry import journal, reading
 from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
 from trirail.telemetry.drawn_robot import DrawnRobot
-from trirail.telemetry.reading import OlderRecordingWarning, read
+from trirail.telemetry.reading import OlderRecordingWarning, SkippedFileWarning, read, read_session
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import Scene
 from trirail.wire.messages import Event
@@ -241,6 +241,39 @@ def test_an_error_names_the_file_and_not_a_copy(file_left_open: bytes, cut: int,
             read(path)
         assert str(raised.value).startswith(str(path))
         assert set(re.findall(r"\S*a\.rrd", str(raised.value))) == {str(path)}
+
+
+ABORTING = """
+import os, random, sys
+from rerun.chunk import RrdReader
+whole, chance = open(sys.argv[1], "rb").read(), random.Random(1)
+for _ in range(1000):
+    damaged = bytearray(whole)
+    damaged[chance.randrange(len(whole))] ^= 1 << chance.randrange(8)
+    open(sys.argv[2], "wb").write(damaged)
+    if not (child := os.fork()):
+        try:
+            [None for _ in RrdReader(sys.argv[2]).stream()]
+        finally:
+            os._exit(0)
+    if os.WIFSIGNALED(os.waitpid(child, 0)[1]):
+        break
+else:
+    sys.exit("Rerun aborts at no damage any more: remove the decoding in another process")
+"""
+
+
+def test_damage_at_which_rerun_aborts_is_told_and_other_files_are_read(tmp_path: Path) -> None:
+    """Rerun aborts at one in sixty flipped bits."""
+    whole, damaged = tmp_path / "a.rrd", tmp_path / "a-part2.rrd"
+    written(whole, made.records(0.1))
+    command = [sys.executable, "-c", ABORTING, whole, damaged]
+    found = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr[-500:]
+    with pytest.raises(ServiceError, match=f"^{damaged}: damaged: Rerun's decoder ended with SIGABRT$"):
+        read(damaged)
+    with pytest.warns(SkippedFileWarning, match="SIGABRT"):
+        assert made.bits(read_session([damaged, whole]).records) == made.bits(read(whole).records)
 
 
 def test_a_file_that_the_operating_system_refuses_is_refused_with_its_path(
