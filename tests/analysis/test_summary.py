@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from trirail.analysis.summary import summarise
 from trirail.cli import recording_commands
 from trirail.telemetry.recording import Recording
-from trirail.wire.packets import CommandRequest, ControlInput
+from trirail.wire.goals import PoseGoal
+from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, AcquireLease, Command, Mode
 
@@ -55,6 +56,19 @@ def recorded(records: NDArray[np.void]) -> Recording:
 @given(st.integers(0, 2**32 - 1))
 def test_the_travel_is_that_of_motions_and_not_of_noise_homing_or_hands(seed: int) -> None:
     assert summarise(recorded(session(seed))).distance == pytest.approx((0.051,) * 3, abs=1e-9)
+
+
+@given(rate=st.sampled_from([rate for rate in range(1, 4001) if 1_000_000 % rate == 0]), days=st.integers(0, 400))
+def test_goals_begin_in_their_cycle_also_after_days(rate: int, days: int) -> None:
+    records = session(0)
+    records["cycle"] += days * 86400 * rate
+    nominal = records["cycle"] * (1_000_000_000 // rate) / 1e9
+    requests = tuple(
+        ControlInput(number, int(cycle), 0, GoalRequest(number, "ann", f"g-{number}", PoseGoal(0.0, 0.0, 0.0), 0))
+        for number, cycle in enumerate(records["cycle"][::100])
+    )
+    goals = summarise(recorded(records)._replace(t=nominal, requests=requests)).goals
+    assert [goal.given for goal in goals] == pytest.approx(nominal[::100].tolist(), abs=1e-6, rel=0.0)
 
 
 @given(lost=st.sets(st.integers(1, 708)), seed=st.integers(0, 9))

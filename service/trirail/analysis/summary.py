@@ -164,8 +164,10 @@ def summarise(recording: Recording) -> Summary:
 
 
 def _period(recording: Recording) -> float:
-    steps = np.diff(recording.t)
-    return float(np.median(steps)) if len(steps) else 1e-3
+    """Return the time of a cycle [s], which is a whole number of microseconds."""
+    # After days, the steps of t are less exact: a float of 10^6 s has a resolution of 10^-10 s.
+    cycle = int(recording.records["cycle"][-1])
+    return round(float(recording.t[-1]) / cycle, 6) if cycle else 1e-3
 
 
 def _distance(records: NDArray[np.void]) -> Triple:
