@@ -44,6 +44,7 @@ def records(
     made["lateness_ns"][late] += random.integers(60_000, 320_000, len(late))
     made["parts_ns"] = random.gamma(40.0, 500.0, (n, 8)) * [0.9, 2.2, 0.3, 1.4, 0.8, 1.8, 0.7, 0.2]
     made["mode"] = MODES.index(mode)
+    made["homed"] = True
     made["drive_state"] = PowerState.OPERATION_ENABLED
     made["commanded_pose"] = commanded
     made["commanded_pose_velocity"] = velocity

@@ -27,6 +27,7 @@ from trirail.cli import recording_commands
 from trirail.config import SIM, as_built, load
 from trirail.errors import ServiceError, TrirailError
 from trirail.kinematics.correction import Correction
+from trirail.kinematics.geometry import singular_angles
 from trirail.kinematics.robot import inverse
 from trirail.telemetry import journal, provenance
 from trirail.telemetry.reading import read
@@ -36,6 +37,7 @@ from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE
 
 SHIPPED = sorted(path for path in SIM.parent.glob("*.toml"))
+SINGULAR = singular_angles(config.geometry(load(SIM).geometry))[0]
 FAULT = Event("fault", "error", "drive B: EMCY 8611h", seq=1, t=0.4, cycle=400, time=0.0,
               fault=FaultDetail("emcy", "B", 0x8611))  # fmt: skip
 
@@ -99,6 +101,27 @@ def test_every_number_comes_back_to_the_last_bit(reader: Any, recording: Recordi
     assert frames == [[mcap.MEASURED, mcap.COMMANDED]] * len(records)
     events = [json.loads(m.data) for _, m in found["/events"]]
     assert msgspec.convert(events[-1], Event) == FAULT
+
+
+@given(
+    unhomed=st.sets(st.tuples(st.integers(0, 499), st.integers(0, 2)), max_size=20),
+    unknown=st.sets(st.tuples(st.integers(0, 499), st.sampled_from((math.nan, math.inf, SINGULAR))), max_size=5),
+)
+def test_cycles_without_a_pose_have_no_motion_and_end_nothing(
+    recording: Recording, unhomed: set[tuple[int, int]], unknown: set[tuple[int, float]]
+) -> None:
+    settings = load(SIM)
+    records = recording.records.copy()
+    for row, slider in unhomed:
+        records["homed"][row, slider] = False
+    for row, value in unknown:
+        records["pose"][row] = 0.0, 0.0, value
+    without = {row for row, _ in unhomed | unknown}
+    times = [int(wall) for row, wall in enumerate(recording.wall.astype(np.int64)) if row not in without]
+    made = list(mcap.messages(recording._replace(records=records), config.corrected_geometry(settings)))
+    for topic in ("/joint_states", "/pose", "/commanded_pose", "/tf"):
+        assert [wall for wall, name, _ in made if name == topic] == times
+    assert {name for _, name, _ in made} == set(mcap.TOPICS)
 
 
 def test_modes_and_faults_are_diagnostics(recording: Recording, exported: Path) -> None:

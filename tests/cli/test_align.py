@@ -84,9 +84,7 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     assert [(view["view"], view["changed"]) for view in told["views"]] == [("left", False), ("right", False)]
     assert told["missing"] == []
     whole = part.read_text(encoding="utf-8")
-    part.write_text(
-        json.dumps({"left": [-0.0597, 0.0103]}), encoding="utf-8"
-    )
+    part.write_text(json.dumps({"left": [-0.0597, 0.0103]}), encoding="utf-8")
     told = json.loads(trirail("align", "check", kept, *marks, "--moves", "--json", code=1).stdout)
     assert ([view["view"] for view in told["views"]], told["missing"]) == (["left"], ["right"])
     told = trirail("align", "check", kept, *marks, "--moves", code=1).stdout

@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from trirail import config
 from trirail.analysis.new_file import new_file
-from trirail.errors import ServiceError
+from trirail.errors import KinematicsError, ServiceError
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse, jacobians
 from trirail.telemetry import provenance
@@ -122,18 +122,26 @@ def _write_bag(folder: Path, made: Iterator[Message]) -> int:
 
 
 def _motion(recording: Recording, geometry: Geometry) -> Iterator[Message]:
-    """Yield the messages of each cycle, in order of time. The order differs from that of the cycles if a clock was set.
+    """Yield the messages of each cycle with a pose, in order of time. This differs from cycles if a clock was set.
 
     The cycles are converted in blocks, because the arrays of a whole recording would need much memory.
     """
     order = np.argsort(recording.wall, kind="stable")
+    has_pose = recording.records["homed"].all(axis=1) & np.isfinite(recording.records["pose"]).all(axis=1)
+    order = order[has_pose[order]]
     for start in range(0, len(order), BLOCK_ROWS):
         rows = order[start : start + BLOCK_ROWS]
         yield from _block_motion(recording.records[rows], _nanoseconds(recording.wall[rows]), geometry)
 
 
 def _block_motion(records: NDArray[np.void], walls: list[int], geometry: Geometry) -> Iterator[Message]:
-    positions, velocities = joint_motion(records, geometry)
+    try:
+        positions, velocities = joint_motion(records, geometry)
+    except (KinematicsError, np.linalg.LinAlgError):  # a row has no pose that the legs can reach: leave it out
+        if half := len(records) // 2:
+            yield from _block_motion(records[:half], walls[:half], geometry)
+            yield from _block_motion(records[half:], walls[half:], geometry)
+        return
     joint_state, pose_stamped = STORE.types["sensor_msgs/msg/JointState"], STORE.types["geometry_msgs/msg/PoseStamped"]
     tf_message, names, no_effort = STORE.types["tf2_msgs/msg/TFMessage"], list(JOINTS), np.zeros(0)
     poses = zip(records["pose"].tolist(), records["commanded_pose"].tolist(), strict=True)

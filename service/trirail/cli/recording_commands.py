@@ -111,7 +111,7 @@ def export(
     """Write a recorded session as a table, CSV, Parquet or numpy, or as MCAP.
 
     The table has one row per cycle, in SI units. The measured pose is valid only in rows with all sliders homed.
-    MCAP contains ROS 2 messages for Foxglove, PlotJuggler and ros2 bag.
+    MCAP contains ROS 2 messages for Foxglove, PlotJuggler and ros2 bag, with joints and poses only of these rows.
 
     Parameters
     ----------
