@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trirail.client.stage_as_built import built_otherwise
 from trirail.commissioning import config_edit
-from trirail.config import SIM, as_built, everything, geometry, load, parse
+from trirail.config import SIM, as_built, everything, geometry, load, parse, parse_values
 from trirail.errors import ConfigError
 from trirail.kinematics.correction import Correction
 from trirail_drivers.interface import NAMES
@@ -57,6 +58,22 @@ def test_an_inline_table_is_changed_too() -> None:
     written = config_edit.edit_text(text, {"drives.B.direction": -1, "drives.B.node": 7})
     assert "# mine" in written
     assert (parse(written).drives.B.direction, parse(written).drives.B.node) == (-1, 7)
+
+
+SYMMETRIC = "[geometry]\nl0 = 0.3"
+
+
+@pytest.mark.parametrize("way", ["geometry = { l0 = 0.3 }", "geometry.l0 = 0.3", f"\n{SYMMETRIC}"])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_symmetric_geometry_gets_legs_however_it_is_written(way: str, seed: int) -> None:
+    text = SIM.read_text(encoding="utf-8")
+    assert text.count(SYMMETRIC) == 1
+    head, _, tail = text.partition(SYMMETRIC)
+    text = f"{head}{way}{tail}" if way.endswith(SYMMETRIC) else f"{way}\n{head}{tail.partition(chr(10))[2]}"
+    rng = np.random.default_rng(seed)
+    robot = built_otherwise(geometry(parse(text).geometry), rng, 1e-4, 1e-3)
+    written = parse_values(config_edit.edit_geometry(text, robot, (1e-4, 0.0, -1e-4), None))
+    assert as_built.geometry_of(geometry(written.geometry)) == as_built.geometry_of(robot)
 
 
 def test_what_would_be_no_configuration_is_not_written() -> None:

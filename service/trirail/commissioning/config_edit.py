@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import tomlkit
 from msgspec import structs
-from tomlkit.items import Table
+from tomlkit.items import AoT, Array, InlineTable, Table
 from trirail_drivers import files
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES, Triple
@@ -80,10 +80,7 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
                     table[key] = value
     else:
         section.remove("l0")
-        legs = tomlkit.aot()
-        for row in rows:
-            legs.append(tomlkit.item(row))
-        section["leg"] = legs
+        section["leg"] = _inline_tables(rows) if isinstance(section, InlineTable) else _tables(rows)
     axes: dict[str, float] = {}
     for name, drive, scale in zip(NAMES, before.drives.each, scales, strict=True):
         # With twelve digits, the readings are exact to 0.1 nm even if the offset is 100 m, the largest that is allowed.
@@ -100,6 +97,23 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
     document = tomlkit.parse(result)
     document.setdefault("correction", tomlkit.table())["map"] = map_file
     return tomlkit.dumps(document)
+
+
+def _tables(rows: Iterable[Mapping[str, object]]) -> AoT:
+    tables = tomlkit.aot()
+    for row in rows:
+        tables.append(tomlkit.item(row))
+    return tables
+
+
+def _inline_tables(rows: Iterable[Mapping[str, object]]) -> Array:
+    """Return an array of inline tables: an inline table cannot contain other tables."""
+    array = tomlkit.array().multiline(True)
+    for row in rows:
+        table = tomlkit.inline_table()
+        table.update(row)
+        array.append(table)
+    return array
 
 
 def mark_mistake(text: str, errors: AsBuilt | None) -> tuple[str, str | None]:
@@ -138,15 +152,14 @@ def add_simulated_build(text: str, drives: Drives) -> str:
     Simulated faults are deviations from these values, so a correction in [drives] must not change the values.
     """
     document = tomlkit.parse(text)
-    rows = tomlkit.array().multiline(True)
-    for drive in drives.each:
-        row = tomlkit.inline_table()
-        row.update({"node": drive.node, "counts_per_metre": drive.counts_per_metre, "direction": drive.direction})
-        rows.append(row)
+    rows = [
+        {"node": drive.node, "counts_per_metre": drive.counts_per_metre, "direction": drive.direction}
+        for drive in drives.each
+    ]
     can = document["can"]
     if "simulated" not in can:
         can["simulated"] = tomlkit.table()
-    can["simulated"]["built"] = rows
+    can["simulated"]["built"] = _inline_tables(rows)
     return tomlkit.dumps(document)
 
 
