@@ -39,6 +39,14 @@ def test_a_code_is_read_in_any_direction_and_placed(family: CodeFamily, mirror: 
         assert found.side == pytest.approx(SIDE * SCALE, rel=0.01)
 
 
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_codes_are_read_at_every_depth(bits: int) -> None:
+    picture, at = drawn(code_shape("4x4_50", 7, SIDE), 0.4, 1.0, np.random.default_rng(bits))
+    (found,) = find_codes((picture * 2.0 ** (bits - 8)).astype(np.uint16), "4x4_50")
+    assert found.number == 7
+    assert (found.mark.u, found.mark.v) == pytest.approx(at, abs=0.03)
+
+
 def test_codes_are_placed_as_well_as_discs_of_their_size() -> None:
     rng = np.random.default_rng(5)
     codes, discs = [], []

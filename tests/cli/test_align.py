@@ -188,6 +188,21 @@ def test_codes_of_pictures_are_named_by_their_numbers_and_no_number_may_be_there
         look()
 
 
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_pictures_of_more_than_eight_bits_keep_them(bits: int, tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    view, rng = CameraView((0.0, 0.0), (160.0, 120.0), ((2.5e5, 0.0), (0.0, -2.5e5))), np.random.default_rng(bits)
+    errors = []
+    for place in rng.uniform(-2e-5, 2e-5, (8, 2)).tolist():
+        marks = {"m": DrawnMark(MarkShape("cross", 200e-6), (place[0], place[1]))}
+        camera = SimulatedCamera(view, marks, 320, 240, 60.0, 120.0)
+        shown = camera.picture(lambda _: (0.0, 0.0, 0.0), 0.0, rng) + rng.normal(0.0, 1.0, (240, 320))
+        cv2.imwrite(str(tmp_path / "m.png"), np.rint(shown.clip(0.0) * 2.0 ** (bits - 8)).astype(np.uint16))
+        with mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _):
+            errors.append(np.subtract(look()["m"], camera.pixels_at((0.0, 0.0, 0.0))["m"]))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.01
+
+
 def test_pictures_that_are_not_taken_anew_or_are_none_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

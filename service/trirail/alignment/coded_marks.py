@@ -52,8 +52,11 @@ def find_codes(picture: NDArray[np.generic], family: CodeFamily) -> list[CodedMa
     enough that a code is found, because some codes are their own mirror images. Raises ImportError if OpenCV is not
     installed.
     """
-    grey = np.ascontiguousarray(picture, np.uint8)
-    detections, reflected = _detect(grey, family), _detect(grey[:, ::-1], family)
+    grey = np.asarray(picture, float)
+    # OpenCV needs 8 bits. The values of a camera with 10 or 12 bits use only a part of 16 bits.
+    low, high = float(grey.min()), float(grey.max())
+    eight_bits = np.rint((grey - low) * (255.0 / max(high - low, 1e-300))).astype(np.uint8)
+    detections, reflected = _detect(eight_bits, family), _detect(eight_bits[:, ::-1], family)
     is_mirrored = len(reflected) > len(detections)
     if is_mirrored:
         detections = [(number, _mirrored(corners, grey.shape[1])) for number, corners in reflected]
@@ -70,7 +73,7 @@ def find_codes(picture: NDArray[np.generic], family: CodeFamily) -> list[CodedMa
         if is_mirrored:  # in the picture, the second axis of the code is on the other side of the first axis
             shape = shape._replace(cells=shape.cells[::-1])
         u, v = corners.mean(axis=0).tolist()
-        mark = fit_at(np.asarray(grey, float), shape, (u, v), turn)
+        mark = fit_at(grey, shape, (u, v), turn)
         if mark is not None:
             marks.append(CodedMark(number, mark, side * mark.size))
     return marks

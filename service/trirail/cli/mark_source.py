@@ -165,7 +165,7 @@ def folder(
                     f"{path}: no picture {window.picture} for mark {name}; there are {', '.join(pictures)}"
                 )
             whole_by = time.monotonic() + WRITE_TIMEOUT_S
-            while (grey := cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) is None:
+            while (grey := cv2.imread(str(file), cv2.IMREAD_ANYDEPTH)) is None:
                 if time.monotonic() > whole_by:
                     raise TrirailError(
                         f"{file}: OpenCV cannot read this picture; write it as .{file.name}, then rename it"
