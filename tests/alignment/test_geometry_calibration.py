@@ -6,11 +6,13 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
+import msgspec
 import numpy as np
 import pytest
 from alignment.cameras import FIELD, BuiltStage, wide_camera
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from trirail.alignment.calibration_diff import compare_views
 from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.geometry_calibration import (
     GeometryCalibration,
@@ -240,6 +242,23 @@ def test_the_frame_and_the_length_are_those_of_the_configuration() -> None:
 def _elsewhere(robot: Geometry) -> Geometry:
     legs = [dataclasses.replace(leg, anchor=(leg.anchor[0] + 2e-4, leg.anchor[1] - 1e-4)) for leg in robot.legs]
     return dataclasses.replace(robot, legs=tuple(legs))
+
+
+@pytest.mark.parametrize("name", sorted(STAGES))
+@pytest.mark.generated(*range(4))
+def test_a_check_after_the_calibration_of_the_geometry_tells_small_shifts(seed: int, name: str) -> None:
+    """The legs are unknown to some micrometres, and the same in both. Cameras are told much better than the legs."""
+    made, task = stage(name, seed, noise=0.05)
+    found = made.drive(calibrate_geometry(task._replace(looks=4)))
+    made.configured, made.scales = found.geometry, (1.0 + made.scales) / (1.0 + np.array(found.scales)) - 1.0
+    made.pose = (0.0, 0.0, 0.0)
+    right, way = made.views["right"], 1e-5
+    made.views["right"] = msgspec.structs.replace(right, origin=(right.origin[0] - way, right.origin[1]))
+    left, right_change = compare_views(found.cameras, made.drive(repeat_calibration(found.cameras, 4)))
+    assert not left.is_changed
+    assert right_change.is_shifted
+    assert right_change.shift_deviation[0] < 1.5e-6
+    assert abs(right_change.shift[0] - way) < 6.0 * right_change.shift_deviation[0]
 
 
 def test_planned_poses_tell_more_than_random_ones_and_keep_marks_in_the_pictures() -> None:

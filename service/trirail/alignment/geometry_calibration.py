@@ -32,7 +32,7 @@ from trirail.alignment.images import Lens, Pair
 from trirail.alignment.pose_plan import choose_poses, find_candidates
 from trirail.alignment.residual_map import ResidualMap, fit_residual_map
 from trirail.alignment.rigid_motion import Floats
-from trirail.alignment.stage_fit import StageFit, fit_stage
+from trirail.alignment.stage_fit import StageFit, camera_covariance, fit_stage
 from trirail.alignment.stage_model import StageLook, StageModel, list_marks
 from trirail.errors import AlignmentError, AlignmentFault, RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry, Room, travels
@@ -443,16 +443,19 @@ def _outliers(fit: StageFit, looks: Sequence[StageLook]) -> tuple[Outlier, ...]:
 def calibrated_cameras(
     model: StageModel, fit: StageFit, looks: Sequence[StageLook], pictures: int
 ) -> CameraCalibration:
-    """Return cameras and marks in the form that trirail.alignment.procedure.align needs."""
+    """Return cameras and marks in the form that trirail.alignment.procedure.align needs.
+
+    Their deviations are those for known legs, because a later calibration has the same legs.
+    """
     state, poses = model.state(fit.unknowns), model.poses(fit.unknowns, looks)
     marks, covariances = {}, {}
-    every = np.arange(model.size)
+    every, covariance = np.arange(model.size), camera_covariance(model, looks, fit)
     for view in state.views:
         shown = [name for name in model.places if model.view_of[name] == view]
         numbers = [every[model.view_unknowns(view)], *(every[model.mark_unknowns(name)] for name in shown)]
-        covariances[view] = tuple(map(tuple, fit.covariance[np.ix_(*[np.concatenate(numbers)] * 2)].tolist()))
+        covariances[view] = tuple(map(tuple, covariance[np.ix_(*[np.concatenate(numbers)] * 2)].tolist()))
         for name in shown:
-            x, y = np.sqrt(np.diag(fit.covariance)[model.mark_unknowns(name)]).tolist()
+            x, y = np.sqrt(np.diag(covariance)[model.mark_unknowns(name)]).tolist()
             marks[name] = MarkFit(view, state.places[name], (x, y))
     residuals: list[dict[str, Pair]] = [{} for _ in looks]
     for (number, name), residual, used in zip(

@@ -102,16 +102,27 @@ def fit_stage(
 def _result(
     model: StageModel, looks: Sequence[StageLook], unknowns: Floats, used: NDArray[np.bool], basis: Floats, doubt: float
 ) -> StageFit:
-    residuals = model.residuals(unknowns, looks)
-    jacobian = model.jacobian(unknowns, looks)[used].reshape(-1, model.size) @ basis
-    legs = model.legs
+    residuals, legs = model.residuals(unknowns, looks), model.legs
     freedom = max(2 * int(used.sum()) - basis.shape[1], 1)
     noise = float(np.sqrt((residuals[used] ** 2).sum() / freedom))
-    information = np.concatenate([jacobian, noise / doubt * np.eye(legs, model.size) @ basis])  # with the drawings
+    drawings = noise / doubt * np.eye(legs, model.size) @ basis
+    covariance = _covariance(model.jacobian(unknowns, looks)[used], basis, drawings, noise)
+    return StageFit(unknowns, covariance, basis[:legs, : basis.shape[1] - (model.size - legs)], noise, residuals, used)
+
+
+def _covariance(jacobian: Floats, basis: Floats, drawings: Floats, noise: float) -> Floats:
+    rows = jacobian.reshape(-1, len(basis)) @ basis
+    information = np.concatenate([rows, drawings])
     scales = np.maximum(np.linalg.norm(information, axis=0), 1e-300)
     inverse = np.linalg.pinv(information / scales)
-    covariance = basis @ ((inverse @ inverse.T) / np.outer(scales, scales)) @ basis.T * noise**2
-    return StageFit(unknowns, covariance, basis[:legs, : basis.shape[1] - (model.size - legs)], noise, residuals, used)
+    return np.asarray(basis @ ((inverse @ inverse.T) / np.outer(scales, scales)) @ basis.T * noise**2)
+
+
+def camera_covariance(model: StageModel, looks: Sequence[StageLook], fit: StageFit) -> Floats:
+    """Return the covariance of cameras and marks for known legs, (size, size); zero for the legs."""
+    cameras = np.eye(model.size)[:, model.legs :]
+    jacobian = model.jacobian(fit.unknowns, looks)[fit.used]
+    return _covariance(jacobian, cameras, np.zeros((0, cameras.shape[1])), fit.noise)
 
 
 def leg_information(model: StageModel, jacobian: Floats) -> Floats:
