@@ -281,6 +281,26 @@ def test_marks_that_are_swapped_in_one_look_are_refused(
 
 
 @pytest.mark.parametrize("lens", LENSES)
+@given(seed=SEEDS, by=st.floats(5e-4, 2e-3), turn=st.floats(5e-3, 0.05), data=st.data())
+def test_a_late_picture_of_one_look_is_refused(
+    lens: Lens, seed: int, by: float, turn: float, data: st.DataObject
+) -> None:
+    stage = two_cameras(seed, lens, noise=0.1)
+    poses = [stage.pose, *calibration_moves(lens, by, turn)]
+    samples = []
+    for stage.pose in poses:
+        samples.append(CalibrationSample(stage.pose, stage.look()))
+    calibrate(samples, lens=lens, centre=(1000.0, 800.0))
+    late = data.draw(st.integers(1, len(poses) - 1))
+    pixels = np.array([list(sample.marks.values()) for sample in samples])
+    travel, move = np.ptp(pixels, axis=0).max(), np.linalg.norm(pixels[late] - pixels[late - 1], axis=1).max()
+    assume(move > 0.2 * travel)  # with a shorter move, it could be a lens that bends
+    samples[late] = samples[late]._replace(marks=samples[late - 1].marks)
+    with pytest.raises(AlignmentError):
+        calibrate(samples, lens=lens, centre=(1000.0, 800.0))
+
+
+@pytest.mark.parametrize("lens", LENSES)
 @given(seed=SEEDS, one=st.booleans())
 def test_a_lens_that_the_calibration_does_not_model_is_no_swap(lens: Lens, seed: int, one: bool) -> None:
     stage = one_camera(seed, lens) if one else two_cameras(seed, lens)

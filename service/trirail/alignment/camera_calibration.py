@@ -30,9 +30,12 @@ STEP_TOLERANCE = 1e-12
 MIN_TRAVEL_PX = 3.0
 """Travel of the marks over all moves below which the marks count as unmoved [pixel]."""
 MAX_RESIDUAL_SHARE = 0.1
-"""Residual of a view, as a fraction of the travel of its marks, above which the pictures do not match the moves. If one
-picture is late by one move, the residual is at least 0.3 of this move. Distortion by a lens causes a residual of
-0.01."""
+"""Residual of a view, as a fraction of the shortest move of a mark between two looks, above which the pictures do not
+match the moves. If one picture is late by one move, the residual is at least 0.12 of this move, with a perspective or
+radial lens, or 0.24, with an affine one."""
+MAX_DISTORTION_SHARE = 0.02
+"""Residual of a view, as a fraction of the travel of its marks over all looks, that is always accepted. Distortion by a
+lens causes a residual of 0.01."""
 SUSPICIOUS_NOISE_PX = 1.0
 """Noise above which marks may be swapped in a sample [pixel]. Marks are located with a noise of about 0.1 pixel."""
 MAX_SWAP_NOISE_SHARE = 0.1
@@ -313,7 +316,7 @@ class _ViewFit:
             if np.abs(step).max() < STEP_TOLERANCE * max(1.0, np.abs(x / scales).max()):
                 break
         self.squares = float(((self._seen - self._project(x)) ** 2).sum())
-        self._check_residual()
+        self._check_residual(x)
         jacobian = self._jacobian(x) * scales
         self.inverse = np.linalg.inv(jacobian.T @ jacobian) * np.outer(scales, scales)
         self.places = x[self.first_place :].reshape(-1, 2)
@@ -347,16 +350,19 @@ class _ViewFit:
                 limit=MIN_TRAVEL_PX,
             )
 
-    def _check_residual(self) -> None:
+    def _check_residual(self, x: Floats) -> None:
         residual = math.sqrt(self.squares / self.freedom)
-        spread = self._spread()
-        if residual > MAX_RESIDUAL_SHARE * spread:
+        computed, spread = self._project(x), self._spread()
+        tracks = [computed[self._mark_index == n] for n in range(len(self.names))]
+        shortest = min(float(np.linalg.norm(np.diff(track, axis=0), axis=1).min(initial=math.inf)) for track in tracks)
+        limit = max(MAX_RESIDUAL_SHARE * min(shortest, spread), MAX_DISTORTION_SHARE * spread)
+        if residual > limit:
             raise AlignmentError(
                 AlignmentFault.STILL,
                 f"view {self._name}: the marks do not follow the moves; the residual is {residual:.1f} pixels, the "
-                f"limit {MAX_RESIDUAL_SHARE * spread:.1f} at a travel of {spread:.0f}; take a new picture at each look",
+                f"limit {limit:.1f} at moves of {shortest:.0f} or more; take a new picture at each look",
                 value=residual,
-                limit=MAX_RESIDUAL_SHARE * spread,
+                limit=limit,
             )
 
     def _spread(self) -> float:
