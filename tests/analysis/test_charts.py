@@ -22,9 +22,11 @@ from trirail.telemetry import palette
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.recording import Recording
 from trirail.wire.goals import SlidersGoal
+from trirail.wire.looks import AlignmentLook, SeenMark
 from trirail.wire.messages import Event, Outcome
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import MODES, Mode
+from wire.looks import told
 
 
 def test_every_mode_has_a_colour_of_its_own_wherever_it_is_shown() -> None:
@@ -83,6 +85,11 @@ def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path:
     for n in range(charts.MAX_LISTED_FAULTS + 2):
         fault = Event("fault", "error", f"drive B: fault $_{{{n}}} $", seq=n + 1, t=0.15 * n, cycle=150 * n, time=1.7e9)
         recorder.event(fault)
+    marks = ("cost $5 or $6", r"$\frac$")
+    for n in (1, 2):
+        seen = tuple(SeenMark(mark, (1.0, 2.0), (1e-4 / n, 0.0)) for mark in marks)
+        look = AlignmentLook("a-1", "alignment", n, seen, end="reached" if n == 2 else None)
+        recorder.event(told(30 + n, look))
     name = "g $x_{1}$ %s"
     recorder.event(Event("goal", "info", "done", id=name, outcome="done", seq=20, t=1.9, cycle=1900, time=1.7e9))
     recorder.control_input(ControlInput(1, 100, 0, GoalRequest(1, "somebody", name, SlidersGoal((0.0, 0.0, 0.0)), 0)))
@@ -95,6 +102,7 @@ def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path:
         assert f"{n + 1}   {0.15 * n:.3f} s   drive B: fault $_{{{n}}} $" in drawn
     assert "and 2 more" in drawn
     assert f"<!-- {name} -->" in drawn
+    assert all(f"<!-- {mark} -->" in drawn for mark in marks)
     assert drawn.count("stroke-dasharray") > 2, "the limit that A came near, beside the period and its legend"
 
 

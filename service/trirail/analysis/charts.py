@@ -71,7 +71,7 @@ def draw(file: Path, recording: Recording, summary: Summary) -> None:
     heights = PANELS | ({RESIDUAL_PANEL: 1.3} if any(each.residuals for each in summary.alignments) else {})
     height = sum(heights.values()) + 1.2 + 0.17 * len(fault_lines)
     figure = Figure(figsize=(FIGURE_WIDTH_IN, height), dpi=150, layout="constrained")
-    figure.suptitle(_title(summary), x=0.008, ha="left", color=INK, fontsize=14, fontweight="bold")
+    figure.suptitle(_title(summary), x=0.008, ha="left", color=INK, fontsize=14, fontweight="bold", parse_math=False)
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=[*heights.values()])
     panels: dict[str, Axes] = dict(zip(heights, axes, strict=True))
     for name, panel in panels.items():
@@ -262,7 +262,7 @@ def _decimate(t: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDAr
 
 
 def _draw_legend(panel: Axes, handles: list[Line2D]) -> None:
-    panel.legend(
+    legend = panel.legend(
         handles=handles,
         loc="lower right",
         bbox_to_anchor=(1.0, 0.97),
@@ -271,6 +271,8 @@ def _draw_legend(panel: Axes, handles: list[Line2D]) -> None:
         fontsize=8,
         labelcolor=INK,
     )
+    for text in legend.get_texts():  # names of marks and sliders
+        text.set_parse_math(False)
 
 
 def _style_axes(axes: Axes) -> None:
