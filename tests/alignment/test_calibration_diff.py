@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,6 +20,7 @@ from trirail.alignment.images import LENSES, CameraView, Lens, Pair
 from trirail.alignment.procedure import StageMotion, calibrate_by_moves, calibration_moves, repeat_calibration
 from trirail.alignment.rigid_motion import rotation_matrix
 from trirail.client import calibration_file
+from trirail_drivers.errors import FileError
 from trirail_drivers.interface import Triple
 
 PART: dict[str, Pair] = {"left": (-0.06, 0.01), "right": (0.06, 0.01)}
@@ -262,6 +265,34 @@ def test_a_calibration_of_an_earlier_version_gets_the_noise_of_each_view(tmp_pat
     for name, mark in found.marks.items():
         assert again.marks[name].deviation == pytest.approx(mark.deviation)
         assert np.array(again.covariances[name]) == pytest.approx(np.array(found.covariances[name]))
+
+
+DAMAGES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "matrix of view left": lambda file: file["views"]["left"].update(matrix=[[2.0, 1.0], [4.0, 2.0]]),
+    "unknown view left": lambda file: file["views"].pop("left"),
+    "one picture a look": lambda file: file.update(looks=0),
+    "one pose": lambda file: file.update(poses=[]),
+    "one mark": lambda file: file.update(marks={}),
+    "covariances: that of view left": lambda file: file["covariances"].update(left=[[1.0, 2.0]]),
+    "covariances: that of view right": lambda file: file["covariances"].pop("right"),
+    "noise is negative": lambda file: file["noises"].update(left=-1.0),
+}
+
+
+@pytest.mark.parametrize("problem", DAMAGES)
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_damaged_file_is_refused_with_the_problem(problem: str, lens: Lens, tmp_path: Path) -> None:
+    rng, file = np.random.default_rng(1), tmp_path / "camera.json"
+    stage = Stage({name: camera(rng, place, lens) for name, place in PART.items()}, PART, rng, 0.1)
+    moves = calibration_moves(lens, 1e-3, 0.02)
+    found: CameraCalibration = stage.drive(calibrate_by_moves(moves, lens=lens, centre=(1000.0, 800.0)))
+    calibration_file.write(file, "robot", found, {})
+    assert calibration_file.read(file).calibration == found
+    content = json.loads(file.read_bytes())
+    DAMAGES[problem](content["calibration"])
+    file.write_text(json.dumps(content))
+    with pytest.raises(FileError, match=rf"camera\.json: calibration.*{problem}.*create it again"):
+        calibration_file.read(file)
 
 
 def test_an_approach_of_other_numbers_can_be_written() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+import numpy as np
 from msgspec import structs
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
@@ -17,6 +18,8 @@ from trirail.alignment.images import Pair
 from trirail.wire.decoding import INVALID, decoded, prepare
 
 VERSION: Literal[1] = 1
+MAX_CONDITION = 1e6
+"""Condition number of the matrix of a view above which it maps the table to a line."""
 
 
 class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -79,6 +82,27 @@ def keep_old(path: Path) -> Path | None:
         raise FileError(f"cannot copy {path} to {old}: {error.strerror}") from error
 
 
+def _problem(calibration: CameraCalibration) -> str | None:
+    """Return the first contradiction in a calibration, which a damaged or edited file can contain; None if valid."""
+    if not calibration.marks or not calibration.poses or calibration.looks < 1:
+        return "calibration: expected at least one mark, one pose and one picture a look"
+    for name, mark in calibration.marks.items():
+        if mark.view not in calibration.views:
+            return f"calibration.marks: mark {name} has the unknown view {mark.view}"
+    for name, view in calibration.views.items():
+        shown = sum(mark.view == name for mark in calibration.marks.values())
+        covariance = calibration.covariances.get(name, ())
+        # In a calibration of the geometry, the unknowns also include the centre of a radial lens.
+        sizes = {6 + bend + 2 * shown for bend in {"affine": (0,), "perspective": (2,), "radial": (1, 3)}[view.lens]}
+        if len(covariance) not in sizes or any(len(row) != len(covariance) for row in covariance):
+            return f"calibration.covariances: that of view {name} does not fit its lens and its marks"
+        if np.linalg.cond(view.matrix) > MAX_CONDITION:
+            return f"calibration.views: the matrix of view {name} is singular"
+    if min([calibration.noise, *calibration.noises.values()]) < 0.0:
+        return "calibration: a noise is negative"
+    return None
+
+
 def read(path: Path) -> CalibrationFile:
     """Read a calibration file. Raises FileError that names the file, the field and the expected value."""
     if not path.exists():
@@ -89,6 +113,8 @@ def read(path: Path) -> CalibrationFile:
     except INVALID as error:
         problem = str(error).replace("`", "")
         raise FileError(f"{path}: {problem}; create it again with trirail align calibrate") from error
+    if problem := _problem(content.calibration):
+        raise FileError(f"{path}: {problem}; create it again with trirail align calibrate")
     if content.calibration.noises:
         return content
     # Earlier versions wrote one noise for all views, from which all covariances follow.
