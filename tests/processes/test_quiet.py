@@ -59,6 +59,7 @@ from trirail_drivers.bus.can_frame import BIT_RATE_SWITCH, CAN_FRAME, CANFD_FRAM
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.connection.opening import simulated_bus
+from trirail_drivers.driver.duplicate_node import COUNT_WINDOW_SYNCS
 from trirail_drivers.interface import NAMES
 from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.protocols import PROTOCOLS
@@ -623,7 +624,9 @@ def test_lost_and_late_positions_and_a_stop_need_no_python(protocol: str, tmp_pa
 
     session = both_ways(CONFIGS[protocol], tmp_path, script, CYCLES)
     assert sum(counts.feedback_lost for counts in session.driver.counts) >= 12
-    assert cycles_by_python(session) <= before[0] + 4
+    # An ODrive's late position may turn back, and Python then counts until the window of SYNCs is over.
+    counted = COUNT_WINDOW_SYNCS if protocol == "odrive" else 0
+    assert cycles_by_python(session) <= before[0] + 4 + counted
 
 
 def stops_first(seed: int) -> dict[int, list[Happening]]:
