@@ -267,7 +267,7 @@ def test_damage_at_which_rerun_aborts_is_told_and_other_files_are_read(tmp_path:
     """Rerun aborts at one in sixty flipped bits."""
     whole, damaged = tmp_path / "a.rrd", tmp_path / "a-part2.rrd"
     written(whole, made.records(0.1))
-    command = [sys.executable, "-c", ABORTING, whole, damaged]
+    command = [sys.executable, "-c", ABORTING, str(whole), str(damaged)]
     found = subprocess.run(command, check=False, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr[-500:]
     with pytest.raises(ServiceError, match=f"^{damaged}: damaged: Rerun's decoder ended with SIGABRT$"):

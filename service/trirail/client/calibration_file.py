@@ -113,8 +113,8 @@ def read(path: Path) -> CalibrationFile:
     except INVALID as error:
         problem = str(error).replace("`", "")
         raise FileError(f"{path}: {problem}; create it again with trirail align calibrate") from error
-    if problem := _problem(content.calibration):
-        raise FileError(f"{path}: {problem}; create it again with trirail align calibrate")
+    if defect := _problem(content.calibration):
+        raise FileError(f"{path}: {defect}; create it again with trirail align calibrate")
     if content.calibration.noises:
         return content
     # Earlier versions wrote one noise for all views, from which all covariances follow.

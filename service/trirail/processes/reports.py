@@ -37,7 +37,7 @@ from trirail.wire.vocabulary import MODES
 
 BATCHES_PER_SECOND = 50
 SENT_AT_ONCE = 8
-"""Maximum numbers of events and of answers that are sent to the gateway at once, so that no cycle becomes late.
+"""Maximum numbers of events and of answers that are sent to the gateway in one call, so that no cycle is late.
 
 A restarted gateway is sent up to EVENTS_KEPT events.
 """
