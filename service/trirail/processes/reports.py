@@ -36,8 +36,8 @@ from trirail.wire.text import quoted
 from trirail.wire.vocabulary import MODES
 
 BATCHES_PER_SECOND = 50
-SENT_AT_ONCE = 8
-"""Maximum numbers of events and of answers that are sent to the gateway in one call, so that no cycle is late.
+SENT_TOGETHER = 8
+"""Maximum number of events, and also of answers, that one call sends to the gateway. More would delay the cycle.
 
 A restarted gateway is sent up to EVENTS_KEPT events.
 """
@@ -152,7 +152,7 @@ class Reports:
         self._unsent_batch = self._batch[: 1 + self.batched * SIZE] if self.batched else None
         self._batch, self._spare, self.batched = self._spare, self._batch, 0
 
-    def pass_on(self, at_most: int = SENT_AT_ONCE) -> None:
+    def pass_on(self, at_most: int = SENT_TOGETHER) -> None:
         """Send the inputs to the control, then at most `at_most` events and answers each, if there are any.
 
         The number of an event's cycle is that of the first cycle that shows its effect. This is the present cycle or,
