@@ -12,6 +12,7 @@ import pytest
 from alignment.cameras import FIELD, BuiltStage, wide_camera
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from trirail.alignment import stage_fit
 from trirail.alignment.calibration_diff import compare_views
 from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.geometry_calibration import (
@@ -182,6 +183,14 @@ def test_legs_far_from_their_configuration_leave_no_more_than_the_noise_of_the_p
     assert not found.is_systematic
     made.end_noise()
     assert misses(made, found, unseen(task, 40)).max() < 0.2
+
+
+def test_a_fit_that_does_not_converge_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_fit, "MAX_ROUNDS", 2)
+    made, task = stage("uvw", 1, noise=0.05)
+    made.built = built_otherwise(task.start, np.random.default_rng(1), 1e-3, 5e-3)
+    with pytest.raises(AlignmentError, match="did not converge in 2 rounds"):
+        made.drive(calibrate_geometry(task))
 
 
 def test_what_no_look_tells_is_named_and_stays_as_configured() -> None:
