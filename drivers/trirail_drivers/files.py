@@ -83,10 +83,13 @@ def replace(path: Path, content: bytes, mode: int = 0o644) -> None:
 
 
 def create(path: Path, content: bytes) -> None:
-    """Create a file like `replace`. Raises FileExistsError if it already exists, and OSError."""
-    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    """Create a file like `replace`, with a mode that follows the umask. After a power cut, the file may be empty.
+
+    Raises FileExistsError if the file already exists, and OSError.
+    """
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
-        replace(path, content)
+        replace(path, content, path.stat().st_mode & 0o777)
     except BaseException:
         path.unlink(missing_ok=True)
         raise

@@ -277,7 +277,6 @@ BY_HAND: dict[str, Callable[[OdriveRig], None]] = {
     "C elsewhere": elsewhere,
     "B short watchdog": short_watchdog,
     "second A 50 mm beside": partial(second_node, apart=0.05),
-    "second A 1 mm beside": partial(second_node, apart=0.001),
 }
 """What fault lines have no words for."""
 
@@ -327,7 +326,6 @@ STOP = [
     ),
     Case("B reboot for 0.1", 3, SILENT.format("B"), stands=ROLLING, lasts=False),
     Case("second A 50 mm beside", 3, rf"{SECOND}|{FOLLOWING.format('A')}"),
-    Case("second A 1 mm beside", 40, SECOND),
     # the bus
     Case("bus-off", 1, r"CAN bus .* is down: bus-off", stands=DEAF),
     Case("nobody acknowledges", 3, r"CAN bus: cannot send: .*the transmit queue is full", stands=DEAF),

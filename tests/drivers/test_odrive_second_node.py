@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import random
+from collections.abc import Callable
+
 import can
 import pytest
-from drivers.test_odrive import Rig
+from drivers.test_odrive import CONFIG, Rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 from rigs import Closing
-from trirail_drivers.driver.duplicate_node import COUNT_WINDOW_SYNCS, FAR_APART_M, FAR_SYNCS
+from trirail_drivers.driver.duplicate_node import FAR_APART_M, FAR_SYNCS
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.flat_endpoints import Version
 from trirail_drivers.simulated import SimulatedOdrive
+from trirail_drivers.simulated.odrive import CAN
 
 NO_ADDRESS = Version((5, 2, 0), (0, 6, 8))
 """A firmware without the message Address."""
@@ -52,6 +57,21 @@ def plug_in(rig: Rig, index: int, apart: float, *, first: bool = False) -> Simul
     return twin
 
 
+def noisy(device: SimulatedOdrive, noise: Callable[[], float]) -> Callable[[int], None]:
+    """Return the drive's function that answers a command, with noise in the position."""
+    answer = device._answer
+
+    def answer_with_noise(command: int) -> None:
+        if command == cansimple.GET_ENCODER_ESTIMATES:
+            turns = device.servo.position - device._zero + noise()
+            device._send(command, cansimple.ESTIMATES.pack(turns, device.servo.velocity))
+        else:
+            answer(command)
+
+    return answer_with_noise
+
+
+TURNS = CONFIG.A.counts_per_metre
 INDEX = st.integers(0, 2)
 APART = st.floats(-0.1, 0.1)
 ORDER = st.booleans()
@@ -96,8 +116,8 @@ def test_an_answer_that_arrives_twice_is_no_second_drive(closing: Closing, firmw
 
 @settings(max_examples=30)
 @example(index=0, apart=0.05, first=True, later=False)
-@given(index=INDEX, apart=APART.filter(lambda apart: abs(apart) > 1e-6), first=ORDER, later=st.booleans())
-def test_two_positions_for_each_request_are_a_fault(index: int, apart: float, first: bool, later: bool) -> None:
+@given(index=INDEX, apart=APART.filter(lambda apart: abs(apart) > 1.01 * FAR_APART_M), first=ORDER, later=st.booleans())
+def test_two_far_positions_for_each_request_are_a_fault(index: int, apart: float, first: bool, later: bool) -> None:
     """The second drive is there from the start, with a firmware that reports no serial number, or comes later."""
     rig = Rig()
     try:
@@ -110,13 +130,29 @@ def test_two_positions_for_each_request_are_a_fault(index: int, apart: float, fi
         plug_in(rig, index, apart, first=first)
         if not later:
             rig.ready()
-        within = FAR_SYNCS if abs(apart) > 1.01 * FAR_APART_M else 2 * COUNT_WINDOW_SYNCS
-        fault = rig.found("frame", within=within + 1)
+        fault = rig.found("frame", within=FAR_SYNCS + 1)
         node = rig.config.each[index].node
         assert fault.message == (
             f"drive {NAMES[index]}: a second node with id {node} on the bus: each request has two positions; "
             "give each its own node id"
         )
+    finally:
+        rig.drives.close()
+
+
+@settings(max_examples=10)
+@example(period_ms=1, noise=0.02, seed=0)
+@given(period_ms=st.integers(1, 10), noise=st.floats(0.0, 0.02), seed=st.integers(0, 99))
+def test_positions_that_come_unasked_show_no_second_drive(period_ms: int, noise: float, seed: int) -> None:
+    """Where `accept_without` permits cyclic messages, several positions `noise` metres apart may answer one request."""
+    each = {name: structs.replace(getattr(CONFIG, name), accept_without=("cyclic_messages",)) for name in NAMES}
+    rig, chance = Rig(structs.replace(CONFIG, **each)), random.Random(seed)
+    try:
+        for device in rig.devices:
+            device.settings[f"{CAN}.encoder_msg_rate_ms"] = period_ms
+            vars(device).update(_answer=noisy(device, lambda: chance.gauss(0.0, noise * TURNS)))
+        rig.ready()
+        assert rig.cycles(1000).fault is None
     finally:
         rig.drives.close()
 

@@ -133,11 +133,13 @@ def test_every_command_is_passed_on(rig: Rig, name: Command) -> None:
 
 
 @pytest.mark.parametrize("name", Command)
-def test_a_command_that_has_waited_long_is_refused_unless_it_stops_or_concerns_the_lease(
-    rig: Rig, name: Command
+@pytest.mark.parametrize("holder", [None, "ann", "bob"])
+def test_a_command_that_has_waited_long_is_refused_unless_it_stops_or_renews_the_lease(
+    rig: Rig, name: Command, holder: str | None
 ) -> None:
+    rig.hear(Status(None, 1.0, None, lease=holder))
     rig.command(name, boundary.encode(carried(name)), waited=MAX_COMMAND_WAIT + 0.1)
-    late = name.stops or name in (Command.ACQUIRE, Command.RELEASE)
+    late = name.stops or (name in (Command.ACQUIRE, Command.RELEASE) and holder == "ann")
     assert [request.name for request in rig.commands()] == [name] * late
     assert [notice.code for notice in rig.refusals()] == [RefusalCode.TIMEOUT] * (not late)
 

@@ -59,7 +59,7 @@ from trirail_drivers.bus.can_frame import BIT_RATE_SWITCH, CAN_FRAME, CANFD_FRAM
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.connection.opening import simulated_bus
-from trirail_drivers.driver.duplicate_node import COUNT_WINDOW_SYNCS
+from trirail_drivers.driver.duplicate_node import FAR_APART_M
 from trirail_drivers.interface import NAMES
 from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.protocols import PROTOCOLS
@@ -574,11 +574,12 @@ def test_a_position_that_comes_twice_is_a_second_nodes_only_if_it_does_so_often(
 
     def say_once_more(session: Session) -> None:
         assert isinstance(session.driver, Cia402 | Odrive)
-        newest = next(axis.newest for axis in session.driver._axes if axis.node == 1)
+        axis = next(axis for axis in session.driver._axes if axis.node == 1)
         if protocol == "cia402":
-            session.inject(CAN_FRAME.pack(0x281, 4, struct.pack("<i", round(newest) + 1)))
+            session.inject(CAN_FRAME.pack(0x281, 4, struct.pack("<i", round(axis.newest) + 1)))
         else:
-            session.inject(CAN_FRAME.pack(0x029, 8, struct.pack("<ff", newest + 1e-3, 0.0)))
+            other = axis.newest + 2.0 * FAR_APART_M * axis.counts_per_metre
+            session.inject(CAN_FRAME.pack(0x029, 8, struct.pack("<ff", other, 0.0)))
 
     happens = {number: [Happening(say_once_more)] for number in range(300, 900, often)}
     one = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 900)
@@ -624,9 +625,7 @@ def test_lost_and_late_positions_and_a_stop_need_no_python(protocol: str, tmp_pa
 
     session = both_ways(CONFIGS[protocol], tmp_path, script, CYCLES)
     assert sum(counts.feedback_lost for counts in session.driver.counts) >= 12
-    # An ODrive's late position may turn back, and Python then counts until the window of SYNCs is over.
-    counted = COUNT_WINDOW_SYNCS if protocol == "odrive" else 0
-    assert cycles_by_python(session) <= before[0] + 4 + counted
+    assert cycles_by_python(session) <= before[0] + 4
 
 
 def stops_first(seed: int) -> dict[int, list[Happening]]:

@@ -28,6 +28,11 @@ def warning(node: int, by: str) -> str:
     return f"a second node with id {node} on the bus: {by}; give each its own node id"
 
 
+def far_apart(row: AxisRow) -> float:
+    """Return FAR_APART_M in the units of a drive."""
+    return abs(row.counts_per_metre) * FAR_APART_M
+
+
 class AnswersPerSync:
     """Detection of two positions with the same identifier after one SYNC, or one request.
 
@@ -41,7 +46,7 @@ class AnswersPerSync:
     def __init__(self, row: AxisRow) -> None:
         """`row` contains the newest position and step of the drive."""
         self._row = row
-        row.far_apart = abs(row.counts_per_metre) * FAR_APART_M
+        row.far_apart = far_apart(row)
         self._two = self._far = False
         self._far_in_a_row = self._with_two = 0
         self._counted_from = 0
@@ -50,7 +55,8 @@ class AnswersPerSync:
     def add_position(self, place: float) -> None:
         """Handle a received position in drive units, before it is stored in the row."""
         if self._row.came:
-            self._two = self._two or turns_back(self._row, place)
+            # The last bits of a float are noise, which turns back.
+            self._two = self._two or (not self._row.floats and turns_back(self._row, place))
             self._far = self._far or is_far(self._row, place)
 
     @property

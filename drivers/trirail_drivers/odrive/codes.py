@@ -9,7 +9,7 @@ from trirail_drivers.odrive.cansimple import Error
 _TUNING: Final = "check load, limits and gains"
 _SUPPLY: Final = "check supply and brake resistor: braking feeds energy back"
 _WORDS: Final = {
-    Error.INITIALIZING: ("it is starting, or was when it lost power", "wait; reset; if it stays, restart the drive"),
+    Error.INITIALIZING: ("it is starting, or lost power while starting", "wait; reset; if it stays, restart the drive"),
     Error.SYSTEM_LEVEL: ("its firmware failed", "restart it; update its firmware"),
     Error.TIMING_ERROR: ("its processor is overloaded", "switch off features that are not needed"),
     Error.MISSING_ESTIMATE: ("it does not know where its motor is", "calibrate the encoder; check its cable"),

@@ -75,6 +75,10 @@ def describe_protection(protection: str) -> str:
     return f"{used.purpose}; without: {used.without}"
 
 
+MAY_SEND_UNASKED: Final = frozenset({"cyclic_messages", "endpoints"})
+"""Protections without which a drive may send positions that were not requested, or without which this is unknown."""
+
+
 def missing_protections(settings: Settings | None, drives: Drives) -> dict[str, str]:
     """Return the reason for each protection that a drive lacks. `settings` is None if its firmware is unknown."""
     if settings is None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Coroutine
 from typing import Any
 
 from trirail_drivers.bus.frames import FrameSender
+from trirail_drivers.driver.duplicate_node import far_apart
 from trirail_drivers.driver.recovery import ReturningDrive
 from trirail_drivers.driver.refusals import replacement_refusal
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Clock
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.client import OdriveClient
+from trirail_drivers.odrive.protections import MAY_SEND_UNASKED
 from trirail_drivers.odrive.setup import OdriveIdentity, OdriveSetup, OdriveSetupTask, OdriveStart, configure_one
 
 
@@ -33,6 +36,12 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         one = self.one
         client = OdriveClient(sender, self.axis.name, self.axis.node, one.drives.sdo_timeout, clock)
         return configure_one(one._replace(client=client), self._check), client
+
+    def record_setup(self, made: OdriveSetup, answered: int) -> None:
+        """Record a complete set-up. Two positions show a second drive only if they are sent on request alone."""
+        super().record_setup(made, answered)
+        unasked = MAY_SEND_UNASKED.intersection(made.missing_protections)
+        self.axis.far_apart = math.inf if unasked else far_apart(self.axis)
 
     def accept(self, made: OdriveSetup, begun: OdriveStart) -> str:
         """Let the drive take part in the cycle.

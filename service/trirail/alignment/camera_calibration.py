@@ -354,8 +354,9 @@ class _ViewFit:
         residual = math.sqrt(self.squares / self.freedom)
         computed, spread = self._project(x), self._spread()
         tracks = [computed[self._mark_index == n] for n in range(len(self.names))]
-        shortest = min(float(np.linalg.norm(np.diff(track, axis=0), axis=1).min(initial=math.inf)) for track in tracks)
-        limit = max(MAX_RESIDUAL_SHARE * min(shortest, spread), MAX_DISTORTION_SHARE * spread)
+        moves = np.concatenate([np.linalg.norm(np.diff(track, axis=0), axis=1) for track in tracks])
+        shortest = float(moves[moves >= MIN_TRAVEL_PX].min(initial=spread))
+        limit = max(MAX_RESIDUAL_SHARE * shortest, MAX_DISTORTION_SHARE * spread)
         if residual > limit:
             raise AlignmentError(
                 AlignmentFault.STILL,

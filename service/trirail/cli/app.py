@@ -54,7 +54,7 @@ app = App(
 def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Literal["text", "json"] | None = None) -> int:
     """Run the service in the foreground until SIGTERM or Ctrl-C.
 
-    The service then makes a controlled stop, disables the drives, and exits with 0.
+    The service then makes a controlled stop, disables the drives, and exits with 0; with 1 if a drive keeps power.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Final, NamedTuple, NoReturn
 
 import numpy as np
@@ -207,13 +207,19 @@ class Bench:
         self.check_without_power()
 
     def prepare_hands_on(self) -> None:
-        """Reset a fault, and check that a person may touch the sliders.
+        """Reset a fault, and check that a person may touch the sliders, as `check_hands_on` does.
 
-        Raises DrivesStoppedError if the fault persists, or if a drive has power.
+        A fault may persist: with a pressed emergency stop, some drives report one.
         """
-        self.clear_fault()
+        with suppress(DrivesStoppedError):
+            self.clear_fault()
         self.wait(REST_CHECK_S)
-        self.check_without_power()
+        self.check_hands_on()
+
+    def check_hands_on(self) -> None:
+        """Raise DrivesStoppedError if a drive has power, or does not answer."""
+        if self.power_warning or any(self.feedback.unready):
+            raise DrivesStoppedError(self._describe())
 
     def play(self, move: SlowMove) -> MeasuredMotion:
         """Move the powered sliders from their targets along `move`, and wait until they have settled."""
@@ -306,8 +312,8 @@ class Bench:
 
     def _describe(self, reason: str = "") -> str:
         """Return a reason, the fault of the drives, and the warning of drives with power, as one line."""
-        fault = self.feedback.fault
-        texts = reason, "" if fault is None else fault.message, self.power_warning
+        fault, unready = self.feedback.fault, filter(None, self.feedback.unready)
+        texts = reason, "" if fault is None else fault.message, *map(str, unready), self.power_warning
         return "; ".join(dict.fromkeys(text for text in texts if text))
 
     def _stop_and_raise(self, reason: str, error: type[DrivesStoppedError] = DrivesStoppedError) -> NoReturn:

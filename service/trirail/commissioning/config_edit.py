@@ -200,7 +200,7 @@ def check_new_file(path: Path) -> None:
 
 
 def write_new_file(path: Path, text: str) -> None:
-    """Write a new file, completely or not at all. Raises ConfigError if the file exists or cannot be written."""
+    """Write a new file. Raises ConfigError if the file exists or cannot be written; nothing of it is left then."""
     try:
         files.create(path, text.encode())
     except FileExistsError:

@@ -45,9 +45,10 @@ INPUT_POLL_S = 0.05
 def _hands_on(
     step: Callable[Concatenate[Steps, Arguments], StepOutcome],
 ) -> Callable[Concatenate[Steps, Arguments], StepOutcome]:
-    """Decorate a step in which a person touches the robot. No drive may have power or a fault before and after it.
+    """Decorate a step in which a person touches the robot. No drive may have power or be silent before and after it.
 
-    Otherwise the step ends as failed, so that the fault of a drive is not blamed on the mechanics.
+    Otherwise the step ends as failed. A step that is not ok while a drive has a fault also ends as failed, so that the
+    fault is not blamed on the mechanics.
     """
 
     @wraps(step)
@@ -56,7 +57,9 @@ def _hands_on(
         try:
             bench.prepare_hands_on()
             outcome = step(self, *args, **keys)
-            bench.check_without_power()
+            bench.check_hands_on()
+            if outcome[0].verdict != "ok":
+                bench.check_without_power()
         except (DrivesStoppedError, DriveError) as error:
             return Judgement("failed", (str(error),), "remove the cause, then repeat this step"), {}
         return outcome

@@ -109,6 +109,16 @@ def powered_drives(measured: MeasuredState) -> str:
     return f"{drives} according to the last statusword"
 
 
+def power_left(measured: MeasuredState) -> str:
+    """Return which drives have power, or may have it because they are silent after a stop; "" if none has power."""
+    fault = measured.feedback.fault
+    if measured.powered:
+        return powered_drives(measured)
+    if fault is not None and fault.cause == "timeout" and any(measured.feedback.unready):
+        return f"{fault.message}, and does not answer"
+    return ""
+
+
 SETTLE = 0.1
 """Time after a reset before the states of the drives are evaluated, so that the drives can leave their fault state
 [s]."""

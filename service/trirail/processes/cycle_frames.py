@@ -160,7 +160,7 @@ def _accept_position(axis: Any, frame: NDArray[np.uint8], at: int, now: float) -
     """
     if axis.floats:
         turns = float(frame[at : at + 4].view(np.float32)[0])
-        if not math.isfinite(turns) or (axis.came and (_turns_back(axis, turns) or _is_far(axis, turns))):
+        if not math.isfinite(turns) or (axis.came and _is_far(axis, turns)):
             return False
         _accept_turns(axis, turns)
     else:

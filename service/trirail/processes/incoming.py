@@ -98,7 +98,7 @@ class Incoming(NamedTuple):
 
 
 MAX_COMMAND_WAIT = 2.0
-"""Maximum time that a command waits for earlier messages [s], except a stop and a renewal of the lease."""
+"""Maximum time that a command waits for earlier messages [s], except stops and renewals of the lease."""
 BURST = 400
 """Number of messages of one user that may be read in a burst."""
 RATE = 200.0

@@ -25,7 +25,7 @@ from trirail_drivers.interface import NAMES, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config
-from trirail.control.commands import powered_drives
+from trirail.control.commands import power_left
 from trirail.errors import ServiceError
 from trirail.kinematics.robot import warm_up
 from trirail.motion.motion_planner import MotionPlanner
@@ -245,6 +245,6 @@ def main(
         heartbeats.record_end(last_cycle)
         for port in ports:
             port.close()
-    if loop.control.measured.powered:
-        raise ServiceError(f"the service has ended, but {powered_drives(loop.control.measured)}: switch off the supply")
+    if powered := power_left(loop.control.measured):
+        raise ServiceError(f"the service has ended, but {powered}: switch off the supply")
     return 0

@@ -287,7 +287,8 @@ class CommandReader:
             return
         if name.starts:
             backlog.check_stops(incoming.number)
-        if not (name.stops or name.ignores_lease):  # a late renewal must not end a lease
+        renews = name.ignores_lease and self._states.lease == user
+        if not (name.stops or renews):
             incoming.check_age()
         ticket = self._requests.command(incoming, user, name, content)
         if goal is not None and (withdrawn or self._inbox.earlier(incoming.number) or self._parts.is_incomplete(goal)):

@@ -271,12 +271,18 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
         raise ServiceError(f"{path}: cannot be read as a recording: {reason}") from error
 
 
+_CRASHES = (signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV)
+"""Signals with which damaged data may end the decoder."""
+
+
 def _check_decoding(whole: Path, path: Path) -> None:
     """Decode a recording in another process. Raises ServiceError if damaged data end this process.
 
     For some damaged data, Rerun reports no error but aborts the process. The check takes about 0.4 s to start Python,
-    and a fifth of the time for reading a large recording.
+    and a fifth of the time for reading a large recording. Where another program contains Python, there is no check.
     """
+    if not Path(sys.executable or "").name.startswith("python"):
+        return
     try:
         command = [sys.executable, "-P", "-W", "ignore", "-c", _DECODE, str(whole)]
         code = subprocess.run(
@@ -284,7 +290,7 @@ def _check_decoding(whole: Path, path: Path) -> None:
         ).returncode
     except OSError as error:
         raise ServiceError(f"{path}: cannot be checked for damage: {error}") from error
-    if code < 0:
+    if -code in _CRASHES:
         raise ServiceError(f"{path}: damaged: Rerun's decoder ended with {signal.Signals(-code).name}")
 
 
