@@ -128,10 +128,10 @@ def test_a_file_that_cannot_be_written_costs_no_other(
 ) -> None:
     replace = files.replace
 
-    def full(path: Path, content: bytes) -> None:
+    def full(path: Path, content: bytes, mode: int) -> None:
         if path.name == "drive-B.dcf":
             raise OSError(errno.ENOSPC, "No space left on device")
-        replace(path, content)
+        replace(path, content, mode)
 
     monkeypatch.setattr(files, "replace", full)
     assert run("drives", "save", str(tmp_path), "--json") == 1
