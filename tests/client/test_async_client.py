@@ -21,8 +21,9 @@ from trirail.client.client import Robot
 from trirail.client.goal import AsyncGoalHandle, AsyncJog
 from trirail.client.lease import AsyncLease
 from trirail.client.track import AsyncTrack
-from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import zenoh_session
+from trirail.wire.goals import Goal, VelocityGoal
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply
 from trirail.wire.state import State
 from waiting import WITHIN
@@ -324,3 +325,30 @@ def test_another_event_loop_is_told_to_enter_a_robot_of_its_own(silent: Silent, 
     with pytest.raises(ServiceError, match="another event loop"):
         asyncio.run(getattr(robot, name)())
     asyncio.run(robot.close())
+
+
+@pytest.mark.parametrize("failed", [2, 3])
+@pytest.mark.parametrize("error", [ServiceError("no robot answers"), RefusedError(RefusalCode.BUSY, "too many")])
+def test_a_jog_brakes_at_its_end_although_a_renewal_has_failed(error: TrirailError, failed: int) -> None:
+    """A jog may last for up to ten seconds without a renewal."""
+    sent: list[float] = []
+
+    async def send(make: Callable[[str], Goal], goal_id: str) -> AsyncGoalHandle:
+        goal = make(goal_id)
+        assert isinstance(goal, VelocityGoal)
+        sent.append(goal.x)
+        if len(sent) == failed:
+            raise error
+        return handle
+
+    handle = AsyncGoalHandle("g", nothing, nothing)
+    vars(handle).update(wait=nothing)
+
+    async def main() -> AsyncJog:
+        async with AsyncJog(send, (0.05, 0.0, 0.0), 0.3) as jog:
+            while len(sent) < failed:
+                await asyncio.sleep(0.01)
+        return jog
+
+    assert asyncio.run(main()).error is error
+    assert sent == [*[0.05] * failed, 0.0]

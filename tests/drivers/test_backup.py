@@ -48,7 +48,7 @@ VOLATILE = {0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1F50, 0x1F51, 0x6040, 0x60
 """What these dictionaries let be written that no drive keeps: targets, offsets, controlwords, commands."""
 HOMING = {0x607C, 0x6098, 0x6099, 0x609A}
 """Objects that set-up writes only where a drive has homing, which these have not."""
-OWNED = {int(name[:4], 16) for name in USES} - HOMING | {0x60A9, 0x60AA, 0x60B0, 0x60B2}
+OWNED = {int(name[:4], 16) for name in USES} - HOMING | {0x60B0, 0x60B2}
 
 
 def set_ups(key: Key) -> bool:
@@ -647,6 +647,22 @@ def test_what_is_in_the_way_of_another_is_written_first(tmp_path: Path) -> None:
     }
     assert rig.restore(saved) == RestoreResult((HIGH, LOW), (), False, "")
     rig.wires.shutdown()
+
+
+@pytest.mark.parametrize(("unit", "factory"), [(0xFFB44700, 0x00B44700), (0x00B44700, 0xFFB44700)])
+def test_numbers_are_restored_with_their_units(tmp_path: Path, unit: int, factory: int) -> None:
+    """The unit of velocity, object 60A9h, is 0.1 rpm or rpm. It is written before the speeds."""
+    make = next(make for make in MAKES if "maxon" in make)
+    with Line(make_eds(tmp_path, make)) as line:
+        values = {(0x60A9, 0): unit, (0x607F, 0): 30_000, (0x6080, 0): 50_000}
+        for key, value in values.items():
+            line.objects.internal(*key).value = value
+        saved = line.save()
+        for key, value in {(0x60A9, 0): factory, (0x607F, 0): 3_000, (0x6080, 0): 5_000}.items():
+            line.objects.internal(*key).value = value
+        done = line.restore(saved)
+        assert (done.written[0], set(done.written), done.left) == ((0x60A9, 0), set(values), ())
+        assert {key: line.objects.internal(*key).value for key in values} == values
 
 
 def test_what_a_drive_changes_with_another_is_given_back_too(tmp_path: Path) -> None:

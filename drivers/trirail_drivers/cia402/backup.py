@@ -12,7 +12,7 @@ from canopen.objectdictionary import ODArray
 
 from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames, setup
-from trirail_drivers.cia402.makers_objects import address, owned
+from trirail_drivers.cia402.makers_objects import UNITS, address, owned
 from trirail_drivers.cia402.objects import Key
 from trirail_drivers.cia402.one_drive import HAS_POWER, wait_for_drive
 from trirail_drivers.cia402.other_masters import exclusive_bus
@@ -238,7 +238,9 @@ async def _restore(
         key: _skip_reason(remote, drive, key, each, saved.origin, drive_origin)
         for key, each in saved.parameters.items()
     }
-    intended = {key: each for key, each in saved.parameters.items() if not kept[key]}
+    # The numbers in the file are in the file's units, which are therefore written first.
+    order = sorted(saved.parameters, key=lambda key: key[0] not in UNITS)
+    intended = {key: saved.parameters[key] for key in order if not kept[key]}
     refused: dict[Key, str] = {}
     for _ in range(MAX_WRITE_ROUNDS):
         done, refused = await _write(remote, intended, progress)
@@ -331,6 +333,8 @@ def _skip_reason(remote: Remote, drive: Drive, key: Key, saved: Parameter, of_fi
         return "is no parameter of the drive"
     if key[0] in _SDO_CHANNELS and of_file.node != of_drive.node:
         return "follows the node id"
+    if key[0] in UNITS:
+        return ""
     names = (saved.name, remote.name_of(key))
     return owned(key, drive) or next(filter(None, (address(key, name, of_drive.vendor) for name in names)), "")
 

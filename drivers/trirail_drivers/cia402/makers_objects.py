@@ -17,7 +17,9 @@ _ADDRESS: Final = "changes node id or bitrate, for which the manufacturer's tool
 _FORBIDDEN: Final = {0x1010: _STORES, 0x1011: _STORES, 0x100B: _ADDRESS}
 _HOMING: Final = (0x607C, 0x6098, 0x6099, 0x609A)
 """Objects that the set-up writes only for a drive with homing."""
-_UNITS_AND_OFFSETS: Final = (0x60A9, 0x60AA, 0x60B0, 0x60B2)
+UNITS: Final = (0x60A9, 0x60AA)
+"""Units of velocity and acceleration. The set-up writes them only for drives whose unit cannot be converted."""
+_UNITS_AND_OFFSETS: Final = (*UNITS, 0x60B0, 0x60B2)
 """Objects that are not in USES but that the set-up may write: units, and offsets of the setpoints."""
 _ADDRESSES: Final = {
     0x0000_00FB: (0x2000, 0x2001),  # maxon, EPOS4 Firmware Specification: Node-ID, CAN bit rate

@@ -281,10 +281,20 @@ class AsyncJog:
         self._over.set()
         if self._renewing is not None:
             await self._renewing  # do not cancel a renewal that has been sent
-        if self._goal is not None and self.result is None and self.error is None:
-            with contextlib.suppress(TrirailError):  # the jog has ended, or its time-out will end it
-                await self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S)
-            await self._goal.wait(self._timeout + STANDS_WITHIN)
+        if self._goal is not None and self.result is None:
+            await self._brake(self._goal)
+
+    async def _brake(self, goal: AsyncGoalHandle) -> None:
+        """Brake the robot and wait until it is at rest; after a failed renewal, for as long as the jog can last."""
+        longest = self._timeout + STANDS_WITHIN
+        try:
+            async with asyncio.timeout(longest if self.error else None):
+                with contextlib.suppress(TrirailError):  # the jog has ended, or its time-out will end it
+                    await self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S)
+                await goal.wait(longest)
+        except (TrirailError, TimeoutError):
+            if self.error is None:
+                raise
 
     async def _send(self, velocity: Velocity, timeout: float) -> AsyncGoalHandle:
         return await self._send_goal(
