@@ -35,7 +35,7 @@ from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.telemetry import contents
 from trirail.wire.goal_kind import GoalKind, field_description
 from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
-from trirail.wire.messages import GoalReply
+from trirail.wire.messages import GoalReply, Outcome
 from trirail.wire.state import NamedPose
 from trirail.wire.text import json_printable
 from trirail.wire.vocabulary import Command
@@ -652,7 +652,7 @@ def named_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("listed")
     name = f"{'robot' * 10}-20260131-120000.rrd"
     (folder / name).touch()
-    outcomes = {"done": 1000, "faulted": 10, "preempted": 100, "stopped": 200}
+    outcomes: dict[Outcome, int] = {"done": 1000, "faulted": 10, "preempted": 100, "stopped": 200}
     users = {f"operator-{number}" for number in range(9)}
     contents.save(
         folder / name, contents.Contents(name, "robot" * 10, 1e9, 1e9 + 5e3, 9, users, {"operator-1": outcomes})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 from pathlib import Path
@@ -13,6 +14,7 @@ from trirail.cli.app import app
 from trirail.cli.drives_command import UNTESTED_NOTE
 from trirail.config import SIM
 from trirail_drivers import files
+from trirail_drivers.cia402 import parameter_file
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.simulated import SimulatedDrive
 
@@ -196,3 +198,21 @@ def test_a_value_that_json_does_not_have_is_a_text(
     assert run("drives", "compare", *paths, "--json") == 1
     (found,) = json.loads(capsys.readouterr().out)["differences"]
     assert (found["one"], found["other"]) == (value, 1.5)
+
+
+def test_a_drive_that_does_not_answer_for_a_parameter_is_not_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = Path(dcf(tmp_path / "one.dcf", 1, "5"))
+    saved = parameter_file.read(path)
+    silent = dataclasses.replace(
+        saved, parameters={}, unread={(0x2000, 0): "no answer within 0.5 s"}, unanswered=frozenset({(0x2000, 0)})
+    )
+    monkeypatch.setattr(drives_command, "_load_config", lambda _: (None, None))
+    monkeypatch.setattr(drives_command, "_load_file", lambda *_: ("A", saved))
+    monkeypatch.setattr(drives_command, "_read", lambda *_: {"A": silent})
+    assert run("drives", "compare", str(path), "--json") == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["unread"], told["only_one"]) == ({"2000:00": "no answer within 0.5 s"}, [])
+    assert run("drives", "compare", str(path)) == 1
+    assert "2000:00 not compared: no answer" in capsys.readouterr().out

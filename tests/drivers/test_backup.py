@@ -282,8 +282,25 @@ def test_a_file_that_was_cut_off_is_refused(seed: int, tmp_path: Path) -> None:
     text = path.read_text()
     cuts = [found.end() for found in re.finditer("ParameterValue=.", text) if "[1005]" in text[: found.start()]]
     path.write_text(text[: random.Random(seed).choice(cuts)])
+    with pytest.raises(DriveError, match=r"a.dcf .*: it ends within a value"):
+        parameter_file.read(path)
+    path.write_text(path.read_text() + "\n")
     with pytest.raises(DriveError, match=r"a.dcf .*: it lists object \w{4} but does not describe it"):
         parameter_file.read(path)
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_a_file_that_ends_within_its_last_value_is_refused(make: str, tmp_path: Path) -> None:
+    """The last object may be the maker's, of which the lists say nothing more."""
+    path = tmp_path / "a.dcf"
+    with Line(make_eds(tmp_path, make)) as line:
+        parameter_file.write(path, line.save())
+    text = path.read_text()
+    for found in [*re.finditer("ParameterValue=.+", text)][-8:]:
+        for end in (found.end(), found.end() - 1):
+            path.write_text(text[:end])
+            with pytest.raises(DriveError):
+                parameter_file.read(path)
 
 
 @pytest.mark.parametrize(
@@ -663,6 +680,12 @@ def test_numbers_are_restored_with_their_units(tmp_path: Path, unit: int, factor
         done = line.restore(saved)
         assert (done.written[0], set(done.written), done.left) == ((0x60A9, 0), set(values), ())
         assert {key: line.objects.internal(*key).value for key in values} == values
+        line.objects.internal(0x60A9, 0).value = factory
+        line.objects.internal(0x607F, 0).value = 3_000
+        line.objects.internal(0x60A9, 0)._limits = None  # not writable
+        with pytest.raises(DriveError, match=r"60A9.*was not accepted"):
+            line.restore(saved)
+        assert line.objects.internal(0x607F, 0).value == 3_000
 
 
 def test_what_a_drive_changes_with_another_is_given_back_too(tmp_path: Path) -> None:

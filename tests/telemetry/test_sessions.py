@@ -11,6 +11,7 @@ from collections import Counter, namedtuple
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import made
 import msgspec
@@ -32,7 +33,7 @@ from trirail.telemetry.retention import sidecar
 from trirail.telemetry.rotation import claim
 from trirail.telemetry.sessions import RecordedSession, SessionFilter, find, recorded
 from trirail.wire.goals import PoseGoal
-from trirail.wire.messages import Event, FaultDetail
+from trirail.wire.messages import Event, FaultDetail, Outcome
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 from trirail.wire.vocabulary import Command
 
@@ -465,7 +466,7 @@ def test_what_is_being_written_is_left_alone(shelf: Path, tmp_path: Path) -> Non
 
 
 names = st.sampled_from(["ann", "ben", "eva"])
-outcomes = st.sampled_from(["done", "stopped", "faulted"])
+outcomes: st.SearchStrategy[Outcome] = st.sampled_from(("done", "stopped", "faulted"))
 when = st.floats(0.0, 100.0)
 faults = st.builds(
     FaultEntry,
@@ -589,3 +590,17 @@ def test_what_stands_beside_a_recording_is_what_was_in_it(found: list[Contents])
 def test_the_name_of_a_black_box_is_that_of_its_faults_time() -> None:
     moment = datetime(2026, 1, 31, 12, 0, 5).astimezone().timestamp()
     assert contents.box_name(moment) == "fault-20260131-120005"
+
+
+@pytest.mark.parametrize(
+    "damage", [{"began": 1e300}, {"began": -1e12}, {"ended": 1e300}, {"goals": {"ann": {"dome": 1}}}, {"cycles": "x"}]
+)
+def test_a_damaged_sidecar_is_none(tmp_path: Path, damage: dict[str, Any]) -> None:
+    """The recording is read instead, and the other sessions are listed."""
+    recording = tmp_path / "x-20260131-120000.rrd"
+    recording.touch()
+    contents.save(recording, Contents(recording.name, "x", 1e9, 1e9 + 1.0, 9))
+    assert contents.load(recording) is not None
+    beside = sidecar(recording)
+    beside.write_text(json.dumps(json.loads(beside.read_text()) | damage))
+    assert contents.load(recording) is None

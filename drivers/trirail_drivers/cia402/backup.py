@@ -238,9 +238,14 @@ async def _restore(
         key: _skip_reason(remote, drive, key, each, saved.origin, drive_origin)
         for key, each in saved.parameters.items()
     }
-    # The numbers in the file are in the file's units, which are therefore written first.
-    order = sorted(saved.parameters, key=lambda key: key[0] not in UNITS)
-    intended = {key: saved.parameters[key] for key in order if not kept[key]}
+    units = {key: each for key, each in saved.parameters.items() if key[0] in UNITS}
+    _, refused_units = await _write(remote, units, progress)
+    for key, why in refused_units.items():
+        raise DriveError(
+            f"drive {remote.name}: object {named(key)}, the unit of the file's values, was not accepted: {why}; no "
+            "other value was written"
+        )
+    intended = {key: each for key, each in saved.parameters.items() if not (kept[key] or key in units)}
     refused: dict[Key, str] = {}
     for _ in range(MAX_WRITE_ROUNDS):
         done, refused = await _write(remote, intended, progress)

@@ -221,7 +221,10 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
     # Unlike an EDS, a DCF with duplicates is refused: nobody can know which of two values to write into a drive.
     strict = configparser.RawConfigParser(allow_no_value=True)
     # In capital letters, because hexadecimal numbers in the names of sections may have letters of either case.
-    strict.read_string(files.text(path, errors="replace").rstrip("\x1a\0 \r\n\t").upper())
+    whole = files.text(path, errors="replace")
+    strict.read_string(whole.rstrip("\x1a\0 \r\n\t").upper())
+    if (last := whole.splitlines(keepends=True)[-1]).lower().startswith("parametervalue") and not last.endswith("\n"):
+        raise ValueError("it ends within a value; is the file complete? If it is, end its last line with a line break")
     with eds.open_text(path) as text:
         sections.read_file(text)
     commissioned: dict[str, int] = {}

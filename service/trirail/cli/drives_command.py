@@ -164,7 +164,7 @@ def compare(
 ) -> int:
     """Show the parameters that differ between two files, or between a file and the drive.
 
-    The exit code is 0 if the products are the same and no parameter differs, otherwise 1.
+    The exit code is 0 if the products are the same, no parameter differs and the drive has answered, otherwise 1.
 
     Parameters
     ----------
@@ -186,13 +186,15 @@ def compare(
         if isinstance(end, DriveError):
             raise end
         two, heading = end, f"drive {name}"
+    unread = {key: two.unread[key] for key in sorted(two.unanswered & one.parameters.keys())}
     differences = parameter_file.compare(one, two)
     compared = parameter_file.comparable(one, two)
     only = [
-        sorted(mine.parameters.keys() - theirs.parameters - {*compared}) for mine, theirs in ((one, two), (two, one))
+        sorted(mine.parameters.keys() - theirs.parameters - {*compared, *unread})
+        for mine, theirs in ((one, two), (two, one))
     ]
     is_same_product = (one.origin.vendor, one.origin.product) == (two.origin.vendor, two.origin.product)
-    ok = is_same_product and bool(compared) and not differences
+    ok = is_same_product and bool(compared) and not (differences or unread)
     if json:
         terminal.json(
             {
@@ -204,6 +206,7 @@ def compare(
                 "differences": [_as_json(each) for each in differences],
                 "only_one": [_named(key) for key in only[0]],
                 "only_other": [_named(key) for key in only[1]],
+                "unread": {_named(key): why for key, why in unread.items()},
             }
         )
         return 0 if ok else 1
@@ -217,6 +220,8 @@ def compare(
     for side, keys in zip((str(file), heading), only, strict=True):
         if keys:
             terminal.print_line(f"only in {side}, not compared: {_abbreviate([_named(key) for key in keys])}")
+    for key, why in unread.items():
+        terminal.print_line(f"{_named(key)} not compared: {why}")
     terminal.print_line(f"{len(differences)} of {len(compared)} parameters differ")
     return 0 if ok else 1
 

@@ -10,15 +10,16 @@ import re
 import stat
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
 from trirail_drivers import files
 
 from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
 from trirail.telemetry.retention import BLACK_BOX, robot_in, sidecar
 from trirail.wire.decoding import INVALID, decoded, prepare
-from trirail.wire.messages import Event, FaultDetail, Notice
+from trirail.wire.messages import Event, FaultDetail, Notice, Outcome
 from trirail.wire.packets import Announcement, CheckRequest, CommandRequest, ControlInput, GoalRequest
 
 _PART = re.compile(r"-part\d+(-\d+)?$")
@@ -26,10 +27,14 @@ STAMP = "%Y%m%d-%H%M%S"
 """Format of the local time in a recording's name: its start time or, for a black box, the time of the fault."""
 
 
+WallTime = Annotated[float, Meta(ge=0.0, le=1e11)]
+"""Time [s since 1970], before the year 5138."""
+
+
 class FaultEntry(msgspec.Struct):
     """Fault in a recording."""
 
-    time: float
+    time: WallTime
     """Time of the fault [s since 1970]."""
     fault: FaultDetail
     message: str
@@ -46,15 +51,15 @@ class Contents(msgspec.Struct):
     name: str
     """Name of the file."""
     robot: str
-    began: float | None = None
+    began: WallTime | None = None
     """Time of the first record [s since 1970]; None if the file contains no records."""
-    ended: float | None = None
+    ended: WallTime | None = None
     """Time of the last record [s since 1970]; None if the file contains no records."""
     cycles: int = 0
     """Number of cycles in the file."""
     users: set[str] = msgspec.field(default_factory=set)
     """Users who sent goals or commands."""
-    goals: dict[str, dict[str, int]] = msgspec.field(default_factory=dict)
+    goals: dict[str, dict[Outcome, int]] = msgspec.field(default_factory=dict)
     """Number of finished goals, by user and then by outcome."""
     faults: list[FaultEntry] = msgspec.field(default_factory=list)
     reason: str | None = None
