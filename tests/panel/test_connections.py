@@ -191,3 +191,19 @@ def test_commands_that_nobody_answers_are_bounded_and_hinder_no_stop(name: str) 
             said = str(tab.recv(PATIENCE))
             answered += '"done","to":"stop"' in said or '"accepted","to":"named"' in said
     assert len(robot.gone_to) == (MAX_PENDING if name == "goto" else 0)
+
+
+@pytest.mark.parametrize("name", ["quick_stop", "disable"])
+def test_stops_that_nobody_answers_keep_out_no_other_kind_of_stop(name: str) -> None:
+    """A stop is answered only when the robot is at rest, and STOP may be pressed many times until then."""
+    robot = FakeRobot()
+    with (
+        Panel(robot.robot(), 0) as inside,
+        connect(f"{inside.url.replace('http', 'ws')}socket", legacy=True) as tab,
+        robot.hanging("stop"),
+    ):
+        for _ in range(2 * MAX_PENDING):
+            tab.send('{"do": "command", "name": "stop"}')
+        tab.send(f'{{"do": "command", "name": "{name}"}}')
+        while f'"done","to":"{name}"' not in (said := str(tab.recv(PATIENCE))):
+            assert f'"refused","to":"{name}"' not in said

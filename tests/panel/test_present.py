@@ -193,6 +193,14 @@ def test_contact_stays_and_the_robot_goes_where_states_are_rare(
         page.close()
 
 
+def test_a_key_that_is_held_presses_once(page: Page) -> None:
+    """Otherwise Enter would also answer the question whether a pose is to be replaced or forgotten."""
+    press = "new KeyboardEvent('keydown', {{key: 'Enter', repeat: {}, bubbles: true, cancelable: true}})"
+    send = f"((event) => (document.querySelector('#forget').dispatchEvent(event), event))({press})"
+    for repeat in ("false", "true"):
+        assert page.evaluate(f"{send.format(repeat)}.defaultPrevented") == (repeat == "true")
+
+
 @pytest.mark.parametrize("language", ["en", "de"])
 @pytest.mark.parametrize("homed", [(True, True, False), (False, True, True), (False, False, False)])
 def test_a_position_that_is_not_homed_is_not_shown_as_measured(
@@ -207,6 +215,7 @@ def test_a_position_that_is_not_homed_is_not_shown_as_measured(
     assert page.evaluate(cells.format("pose")) == [words] * 3
     for known, cell in zip(homed, page.evaluate(cells.format("sliders")), strict=True):
         assert (cell == words, "mm" in cell) == (not known, known)
+    assert page.evaluate("document.querySelector('#here').disabled")
     robot.homed = (True, True, True)
     page.until(f"{drawn} && !document.querySelector('#numbers').innerText.includes({words!r})")
     page.evaluate("localStorage.clear()")

@@ -108,12 +108,12 @@ class TabRequests:
         repeats = isinstance(kind, Command) and not stops and kind is not Command.SET_OUTPUT
         if repeats and self._pending[kind]:
             return
-        place = "stops" if stops else "others"
+        place = kind if stops else "others"  # one kind of stop must not keep out another
         if self._pending[place] >= MAX_PENDING:
             message = f"{MAX_PENDING} commands of this page are already waiting for replies"
             self._reply("refused", to=kind, name=name, message=message, code=RefusalCode.BUSY)
             return
-        self._pending.update((place, kind))
+        self._pending.update({place, kind})
         try:
             done = await send_request()
         except TrirailError as error:
@@ -125,7 +125,7 @@ class TabRequests:
                 seq = done.seq if isinstance(done, CommandReply) else 0
                 self._reply("done", to=kind, name=name, seq=seq)
         finally:
-            self._pending.subtract((place, kind))
+            self._pending.subtract({place, kind})
 
     async def _set_override(self, send: Callable[[], Awaitable[object]]) -> None:
         """Set the override. The operator's slider sends one for each key press."""
@@ -139,7 +139,7 @@ class TabRequests:
             return None
         if name is Command.RELEASE:
             async with self._acquiring:
-                if self._lease is not None:
+                if self._lease is not None and self._lease.lost is None:
                     await self._release()
                     return None
         return await self._robot.command(name, content)

@@ -61,7 +61,7 @@ export class Commands {
     for (const id of ["override", "teach", "forget"]) bar(byId(id), bars[id]);
     for (const id of ["file-start", "follow"]) bar(byId(id), bars.follow);
     for (const control of document.querySelectorAll("[data-output]")) bar(control, bars.set_output);
-    bar(byId("here"), state ? null : ["bar.contact"]);
+    bar(byId("here"), !state ? ["bar.contact"] : this.now().pose ? null : ["bar.not_homed"]);
     return !bars.goal;
   }
 

@@ -50,7 +50,7 @@ export class Hold {
     });
     // It is captured so that its end is told wherever it is; off the button it holds no more, as a finger.
     button.addEventListener("pointermove", (event) => {
-      if (!contains(button, event)) this.#up(`pointer ${event.pointerId}`);
+      if (!(event.buttons & 1) || !contains(button, event)) this.#up(`pointer ${event.pointerId}`);
     });
     for (const up of ["pointerup", "pointercancel", "lostpointercapture"])
       button.addEventListener(up, (event) => this.#up(`pointer ${event.pointerId}`));

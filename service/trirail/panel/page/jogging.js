@@ -101,7 +101,7 @@ export class Jogging {
   #velocity(direction) {
     const { robot, pose } = this.now();
     const along = byId("along").value;
-    const angle = along === "platform" ? pose[2] : (robot.frames[along]?.[2] ?? 0);
+    const angle = along === "platform" ? (pose?.[2] ?? 0) : (robot.frames[along]?.[2] ?? 0);
     const [x, y, phi] = robot.velocity;
     const share = this.speed;
     const [u, v] = rotated([direction.x * share * x, direction.y * share * y], angle);

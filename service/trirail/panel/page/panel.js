@@ -33,7 +33,8 @@ let seen = 0; // the stamp of the newest state that was drawn
 let drawn = true;
 let heard = 0;
 
-const now = () => ({ robot, drawing, state: contact ? state : null, pose: contact ? state.pose : null });
+const now = () => ({ robot, drawing, state: contact ? state : null, pose: contact && homed(state) ? state.pose : null });
+const homed = ({ sliders }) => sliders.homed.every(Boolean); // without one position the pose is unknown
 const line = new Answer(byId("answer"));
 const answer = (what) => line.asked(what);
 const note = (words) => (words ? line.refused(words) : line.clear());
@@ -222,6 +223,8 @@ addEventListener(
       event.preventDefault(); // also where a button or a field has the focus: Space is STOP
       event.stopPropagation();
       if (!event.repeat) stop();
+    } else if (event.key === "Enter" && event.repeat) {
+      event.preventDefault(); // a key that is held presses once, and confirms nothing
     } else if (!types && (event.key === "+" || event.key === "-") && !event.ctrlKey && !event.metaKey) {
       jogging.faster(event.key === "+" ? 1 : -1);
     }

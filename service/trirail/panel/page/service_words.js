@@ -63,6 +63,7 @@ const SHOWN = {
   silence: seconds,
   seconds,
   wait: seconds,
+  duration: seconds,
   until: seconds,
 };
 
