@@ -69,8 +69,8 @@ def _run(machine: Machine, folder: Path, held: Callable[[str, str], None], resul
     # The second service starts while the first service writes its black boxes.
     service.send_signal(signal.SIGTERM)
     second, drives = hil_second.begin(machine)
-    machine.await_end(service, "the service")
-    held("end", "exit code 0 after SIGTERM")
+    machine.await_end(service, "the service", code=1)
+    held("end", "exit code 1 after SIGTERM: its interface is down, and nobody knows whether the drives have power")
     hil_second.run(machine, second, drives, load(folder / "second.toml"), held, result)
     here = sorted(_compiled() - prepared)
     held("compiled code", f"{len(prepared)} functions from outside, {len(here)} compiled here: {', '.join(here)}")

@@ -87,11 +87,11 @@ class Machine:
         process.send_signal(signal.SIGTERM)
         self.await_end(process, name)
 
-    def await_end(self, process: subprocess.Popen[bytes], name: str) -> None:
-        """Wait for the end of a program after SIGTERM. Raises Failed unless it ends in time with exit code 0."""
+    def await_end(self, process: subprocess.Popen[bytes], name: str, code: int = 0) -> None:
+        """Wait for the end of a program after SIGTERM. Raises Failed unless it ends in time with this exit code."""
         wait_until(lambda: process.poll() is not None, f"{name} ends")
-        if process.returncode != 0:
-            raise Failed(f"{name} ended with exit code {process.returncode}, not 0, after SIGTERM")
+        if process.returncode != code:
+            raise Failed(f"{name} ended with exit code {process.returncode}, not {code}, after SIGTERM")
 
     def log(self, name: str) -> str:
         """Return the output of a program up to now."""
