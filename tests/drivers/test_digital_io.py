@@ -325,11 +325,11 @@ def test_compiled_cycles_wait_for_outputs_by_sdo(rig: Rig) -> None:
     ready(rig)
     rig.enable()
     rig.cycles(20)
-    assert rig.drives.lend() is not None
+    assert rig.drives.prepare_tables()
     rig.drives.set_outputs((VALVE, 0, 0))
-    assert rig.drives.lend() is None
+    assert not rig.drives.prepare_tables()
     rig.cycles(3)
-    assert rig.drives.lend() is not None
+    assert rig.drives.prepare_tables()
 
 
 def test_a_drive_that_refuses_its_outputs_later_is_a_fault(rig: Rig) -> None:

@@ -104,7 +104,7 @@ def test_a_socket_gives_compiled_code_frames_of_both_kinds(packets: list[bytes])
         assert (number, error) == (len(packets), 0)
         for row, packet in zip(room.frames, packets, strict=False):
             assert row.tobytes()[: len(packet)] == packet
-        frames.return_frames(room, 0, number, error)
+        frames.put_back(room, 0, number, error)
         assert [frames.receive() for _ in range(number + 1)] == [*map(understood, packets), None]
 
 

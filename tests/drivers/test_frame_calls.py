@@ -72,7 +72,7 @@ def test_what_is_handed_in_is_received_once_more_in_its_order(
     assert number == min(len(arriving), ROOM)
     for row, (identifier, data) in zip(room.frames[:number], arriving, strict=False):
         assert row.tobytes()[: CAN_FRAME.size] == CAN_FRAME.pack(identifier, len(data), data)
-    frames.return_frames(room, handled, handed_in, 0)
+    frames.put_back(room, handled, handed_in, 0)
     left = [*arriving[:number][handled:handed_in], *arriving[number:]]
     assert [frames.receive() for _ in range(len(left) + 1)] == [*left, None]
 
@@ -84,7 +84,7 @@ def test_an_error_is_raised_behind_the_frames_before_it_and_once(before: int, er
     last: Received = 0x7FF, bytearray(b"last")
     frames, room = FrameCalls(Fake([*first, error, last])), PackedFrames(ROOM)
     assert called(frames.access.receive, room, ROOM) == ~before
-    frames.return_frames(room, 0, before, 0)
+    frames.put_back(room, 0, before, 0)
     assert [frames.receive() for _ in range(before)] == first
     with pytest.raises(type(error)):
         frames.receive()

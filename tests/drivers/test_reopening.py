@@ -15,7 +15,7 @@ import pytest
 from control_rig import ControlRig
 from drivers.test_recovery import ENDS, REAL, RecoveryRig, disabled, holding, moving
 from drivers.test_recovery_matrix import stopping
-from processes.test_quiet import odrives
+from processes.test_compiled_cycles import odrives
 from trirail.config import Config
 from trirail.errors import RefusalCode
 from trirail.wire.packets import CommandDone, Refused

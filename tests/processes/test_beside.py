@@ -16,7 +16,7 @@ from control_rig import carried
 from generated import thinned
 from msgspec import structs
 from numpy.typing import NDArray
-from processes.test_quiet import (
+from processes.test_compiled_cycles import (
     CONFIGS,
     CYCLES,
     Happening,
@@ -26,15 +26,15 @@ from processes.test_quiet import (
     script,
     stops_first,
 )
-from processes.test_quiet_outputs import CYCLES as OUTPUT_CYCLES
-from processes.test_quiet_outputs import INPUTS, OUTPUTS, PINS, changes
-from processes.test_quiet_outputs import session as session_with_outputs
+from processes.test_compiled_outputs import CYCLES as OUTPUT_CYCLES
+from processes.test_compiled_outputs import INPUTS, OUTPUTS, PINS, changes
+from processes.test_compiled_outputs import session as session_with_outputs
 from trirail.analysis import replay
 from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes import loop
-from trirail.processes.quiet import Reached
-from trirail.processes.quiet_cycles import QuietCycles
+from trirail.processes.cycle_caller import CycleCaller
+from trirail.processes.cycle_core import Reached
 from trirail.wire import links
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.marks import Mark, StopAt
@@ -57,10 +57,10 @@ REFUSED = re.compile("no setpoint|setpoint refused")
 """Message of the last gate."""
 
 
-def quiet_of(session: Session) -> QuietCycles:
+def caller_of(session: Session) -> CycleCaller:
     """The caller of compiled code of a session."""
-    assert session.loop._quiet is not None
-    return session.loop._quiet
+    assert session.loop._caller is not None
+    return session.loop._caller
 
 
 def recorded(
@@ -112,8 +112,8 @@ def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last
     protocol: str, seed: int, number: int, tmp_path: Path
 ) -> None:
     config = CONFIGS.get(protocol, CONFIGS["cia402"])
-    session = Session(config, tmp_path, "unix", quiet=True)
-    quiet_of(session).cycles_beside = number, number
+    session = Session(config, tmp_path, "unix", compiled=True)
+    caller_of(session).cycles_beside = number, number
     generate = {"two": requests_of_two, "stops": stops_first}.get(protocol)
     happens = generate(seed) if generate is not None else script(seed, protocol)
     try:
@@ -140,8 +140,8 @@ def test_cycles_beside_a_decision_are_recorded_at_a_rate_at_which_a_batch_has_fe
 ) -> None:
     config = CONFIGS["cia402"]
     config = structs.replace(config, loop=structs.replace(config.loop, rate_hz=rate))
-    session = Session(config, tmp_path, "unix", quiet=True)
-    quiet_of(session).cycles_beside = number, number
+    session = Session(config, tmp_path, "unix", compiled=True)
+    caller_of(session).cycles_beside = number, number
     try:
         records, inputs, events = recorded(session, script(3), CYCLES)
     finally:
@@ -156,7 +156,7 @@ def test_cycles_beside_a_decision_are_recorded_at_a_rate_at_which_a_batch_has_fe
 def ask_before_decision(session: Session, command: Command) -> None:
     """Send a command so that the requested decision reads it, before compiled code notices that it is urgent."""
     session.ask(CommandRequest(8000, "ann", command))
-    quiet_of(session)._state.requested_called = True
+    caller_of(session)._state.requested_called = True
 
 
 MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
@@ -188,20 +188,20 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
 ) -> None:
     """The cycles that were under way go on with the motion from before the decision, or a fault ends them."""
     config, chance = CONFIGS["cia402"], random.Random(seed)
-    session = Session(config, tmp_path, "unix", quiet=True)
-    quiet = quiet_of(session)
-    quiet.cycles_beside = number, number
-    run_beside, happened, began = quiet.run_beside, [], []
+    session = Session(config, tmp_path, "unix", compiled=True)
+    caller = caller_of(session)
+    caller.cycles_beside = number, number
+    run_beside, happened, began = caller.run_beside, [], []
 
     def ambushed(*arguments: Any) -> Any:
         if chance.random() < 0.2:
             MISHAPS[mishap](session, chance)
-            began.append(quiet._state.requested)
+            began.append(caller._state.requested)
             happened.append(reached := run_beside(*arguments))
             return reached
         return run_beside(*arguments)
 
-    quiet.run_beside = ambushed  # type: ignore[assignment, method-assign]
+    caller.run_beside = ambushed  # type: ignore[assignment, method-assign]
     happens = script(seed)
     for at in range(200, CYCLES, 120):
         for later, name in enumerate((Command.RESET, Command.ENABLE)):
@@ -232,14 +232,14 @@ def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
 
 def test_a_quick_stop_in_the_second_cycle_beside_a_decision_is_handled_in_it(tmp_path: Path) -> None:
     """The first of these cycles needs Python, so that Python runs the second as well."""
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
-    quiet = quiet_of(session)
-    quiet.cycles_beside = 2, 2
-    run_beside, record = quiet.run_beside, quiet.record
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=True)
+    caller = caller_of(session)
+    caller.cycles_beside = 2, 2
+    run_beside, record = caller.run_beside, caller.record
     asked: list[int] = []
 
     def ambushed(*arguments: Any) -> Any:
-        state = quiet._state
+        state = caller._state
         if state.cycle > 300 and state.until == state.requested + 2 and not asked:
             session.inject(CAN_FRAME.pack(0x123, 2, b"ab"))  # for Python
         return run_beside(*arguments)
@@ -251,7 +251,7 @@ def test_a_quick_stop_in_the_second_cycle_beside_a_decision_is_handled_in_it(tmp
             session.ask(CommandRequest(8000, "ann", Command.QUICK_STOP))
         return number
 
-    quiet.run_beside, quiet.record = ambushed, recorded_first  # type: ignore[assignment, method-assign]
+    caller.run_beside, caller.record = ambushed, recorded_first  # type: ignore[assignment, method-assign]
     try:
         records, inputs, _ = recorded(session, script(1), CYCLES)
     finally:
@@ -267,7 +267,7 @@ def test_a_stop_that_arrives_while_nothing_is_decided_takes_effect_in_its_cycle(
     seed: int, command: Command, tmp_path: Path
 ) -> None:
     chance = random.Random(seed)
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=True)
     asked: list[int] = []
 
     def stop(session: Session) -> None:
@@ -326,8 +326,8 @@ def ramping(what: Callable[[Session], None], later: int) -> dict[int, list[Happe
 def test_what_must_not_wait_does_not_although_a_decision_is_due_in_every_cycle(
     seed: int, number: int, what: str, tmp_path: Path
 ) -> None:
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
-    quiet_of(session).cycles_beside = 1, number
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=True)
+    caller_of(session).cycles_beside = 1, number
     began: list[int] = []
 
     def happens(session: Session) -> None:
@@ -352,8 +352,8 @@ def test_a_frozen_gateway_is_noticed_although_decisions_are_made_in_every_cycle(
     for beside in (0, 0), (1, 1), (2, 2):
         folder = tmp_path / str(beside[0])
         folder.mkdir()
-        session = Session(CONFIGS["cia402"], folder, "unix", quiet=True)
-        quiet_of(session).cycles_beside = beside
+        session = Session(CONFIGS["cia402"], folder, "unix", compiled=True)
+        caller_of(session).cycles_beside = beside
         happens = {
             30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
             100: [Happening(lambda session: session.ask(goal))],
@@ -371,7 +371,7 @@ def test_a_frozen_gateway_is_noticed_although_decisions_are_made_in_every_cycle(
 
 
 def test_stops_while_the_robot_brakes_leave_the_cycles_to_compiled_code(tmp_path: Path) -> None:
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=True)
     before: list[int] = []
 
     def stop(session: Session) -> None:
@@ -397,20 +397,20 @@ def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
     """The edge takes effect after the cycles beside the decision, at the latest."""
     chance = random.Random(seed)
     config = structs.replace(CONFIGS["cia402"], inputs=INPUTS)
-    session = Session(config, tmp_path, "unix", quiet=True)
-    quiet = quiet_of(session)
-    quiet.cycles_beside = number, number
-    run_beside = quiet.run_beside
+    session = Session(config, tmp_path, "unix", compiled=True)
+    caller = caller_of(session)
+    caller.cycles_beside = number, number
+    run_beside = caller.run_beside
     pressed: list[tuple[int, bool]] = []
 
     def ambushed(*arguments: Any) -> Any:
-        if chance.random() < 0.3 and quiet._state.cycle < CYCLES - 10:
+        if chance.random() < 0.3 and caller._state.cycle < CYCLES - 10:
             on = not (pressed and pressed[-1][1])
-            pressed.append((quiet._state.cycle, on))
+            pressed.append((caller._state.cycle, on))
             session.drives.press(1, on << INPUTS["part"].bit)
         return run_beside(*arguments)
 
-    quiet.run_beside = ambushed  # type: ignore[assignment, method-assign]
+    caller.run_beside = ambushed  # type: ignore[assignment, method-assign]
     happens = {30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))]}
     for at in range(200, CYCLES - 40, 160):
         for later in (20, 35, 50):
@@ -439,10 +439,10 @@ def test_an_input_that_changes_beside_a_decision_is_reported_and_stops_its_goal(
 def test_an_edge_from_before_the_start_of_a_goal_does_not_end_it(tmp_path: Path) -> None:
     """It is noticed in the last cycle before the goal, beside the decision that starts the goal."""
     config = structs.replace(CONFIGS["cia402"], inputs=INPUTS)
-    session = Session(config, tmp_path, "unix", quiet=True)
-    quiet = quiet_of(session)
-    quiet.cycles_beside = 2, 2
-    decide = quiet._answer
+    session = Session(config, tmp_path, "unix", compiled=True)
+    caller = caller_of(session)
+    caller.cycles_beside = 2, 2
+    decide = caller._answer
 
     def press_at_start() -> None:
         before = session.loop.control.ledger.goal
@@ -450,7 +450,7 @@ def test_an_edge_from_before_the_start_of_a_goal_does_not_end_it(tmp_path: Path)
         if before is None and session.loop.control.ledger.goal is not None:
             session.drives.press(1, 1 << INPUTS["part"].bit)
 
-    quiet._answer = press_at_start  # type: ignore[method-assign]
+    caller._answer = press_at_start  # type: ignore[method-assign]
     goal = PoseGoal(0.03, 0.0, 0.0, stop_at=StopAt("part", "rising"))
     happens = {
         30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
@@ -471,8 +471,8 @@ def test_an_edge_from_before_the_start_of_a_goal_does_not_end_it(tmp_path: Path)
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.generated(4125785050, 0, 1, 2, 3)
 def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: int, tmp_path: Path) -> None:
-    session = Session(PINS, tmp_path, "unix", quiet=True)
-    quiet_of(session).cycles_beside = number, number
+    session = Session(PINS, tmp_path, "unix", compiled=True)
+    caller_of(session).cycles_beside = number, number
     try:
         records, inputs, events = recorded(session, session_with_outputs(seed), OUTPUT_CYCLES)
     finally:
@@ -492,18 +492,18 @@ def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: in
 
 
 def test_a_warning_of_the_bus_beside_a_decision_is_reported(tmp_path: Path) -> None:
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
-    quiet = quiet_of(session)
-    quiet.cycles_beside = 2, 2
-    run_beside, began = quiet.run_beside, []
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=True)
+    caller = caller_of(session)
+    caller.cycles_beside = 2, 2
+    run_beside, began = caller.run_beside, []
 
     def ambushed(*arguments: Any) -> Any:
-        began.append(quiet._state.cycle)
+        began.append(caller._state.cycle)
         if len(began) == 5:
             session.inject(CAN_FRAME.pack(ERROR | 0x004, 8, bytes((0, 0x10)).ljust(8, b"\0")))  # error-passive
         return run_beside(*arguments)
 
-    quiet.run_beside = ambushed  # type: ignore[assignment, method-assign]
+    caller.run_beside = ambushed  # type: ignore[assignment, method-assign]
     try:
         _, _, events = recorded(session, script(1), CYCLES)
     finally:
@@ -518,8 +518,8 @@ def test_the_override_acts_again_after_a_goal_that_forbids_it_has_been_refused(
     beside: tuple[int, int], tmp_path: Path
 ) -> None:
     """While the goal is planned, the motion before it slows down; nothing else is decided afterwards."""
-    session = Session(PINS, tmp_path, "unix", quiet=True)
-    quiet_of(session).cycles_beside = beside
+    session = Session(PINS, tmp_path, "unix", compiled=True)
+    caller_of(session).cycles_beside = beside
     merged = Mark("valve", start=0.002, end=0.03, increment=0.0004, pulse_width=0.02)
     requests: list[CommandRequest | GoalRequest] = [
         CommandRequest(30, "ann", Command.ENABLE),
@@ -542,8 +542,8 @@ def test_the_override_acts_again_after_a_goal_that_forbids_it_has_been_refused(
 
 
 def test_what_a_command_to_the_drives_beside_cycles_warns_of_is_reported(tmp_path: Path) -> None:
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
-    quiet_of(session).cycles_beside = 1, 1
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=True)
+    caller_of(session).cycles_beside = 1, 1
     disable = session.driver.disable
 
     def refused() -> None:
@@ -565,18 +565,18 @@ def test_what_a_command_to_the_drives_beside_cycles_warns_of_is_reported(tmp_pat
 
 def test_the_parts_of_a_cycle_are_measured_from_its_own_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where a frame that nobody expected makes Python finish the cycles beside a decision."""
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=True)
     monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter_ns=lambda: round(session.clock() * 1e9)))
-    quiet = quiet_of(session)
-    quiet.cycles_beside = 2, 2
-    run_beside, strange = quiet.run_beside, list[int]()
+    caller = caller_of(session)
+    caller.cycles_beside = 2, 2
+    run_beside, strange = caller.run_beside, list[int]()
 
     def ambushed(*arguments: Any) -> Any:
         strange.append(session.loop.control.cycles)
         session.inject(CAN_FRAME.pack(0x123, 2, b"ab"))
         return run_beside(*arguments)
 
-    quiet.run_beside = ambushed  # type: ignore[assignment, method-assign]
+    caller.run_beside = ambushed  # type: ignore[assignment, method-assign]
     try:
         records, _, _ = recorded(session, script(1), CYCLES)
     finally:
@@ -591,10 +591,10 @@ def test_the_parts_of_a_cycle_are_measured_from_its_own_start(tmp_path: Path, mo
 @pytest.mark.parametrize("number", [1, 2])
 def test_commands_to_the_drives_know_the_next_tick(number: int, strange: bool, tmp_path: Path) -> None:
     """They would delay the SYNC; also if a frame that nobody expected has made Python finish the cycles beside."""
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=True)
-    quiet = quiet_of(session)
-    quiet.cycles_beside = number, number
-    run_beside, disable, known = quiet.run_beside, session.driver.disable, list[tuple[float, float]]()
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=True)
+    caller = caller_of(session)
+    caller.cycles_beside = number, number
+    run_beside, disable, known = caller.run_beside, session.driver.disable, list[tuple[float, float]]()
 
     def ambushed(*arguments: Any) -> Any:
         if strange and session.loop.control.cycles > 340:
@@ -605,7 +605,7 @@ def test_commands_to_the_drives_know_the_next_tick(number: int, strange: bool, t
         known.append((session.driver.next_sync, session.ticker.deadline_ns * 1e-9 + session.loop.control.period))
         disable()
 
-    quiet.run_beside, session.driver.disable = ambushed, noted  # type: ignore[assignment, method-assign]
+    caller.run_beside, session.driver.disable = ambushed, noted  # type: ignore[assignment, method-assign]
     happens: dict[int, list[Happening]] = {
         30: [Happening(lambda session: session.ask(CommandRequest(30, "ann", Command.ENABLE)))],
         200: [Happening(lambda session: session.ask(GoalRequest(200, "ann", "g", PoseGoal(0.08, 0.0, 0.0), 0)))],
@@ -655,8 +655,8 @@ def test_a_path_ends_in_the_same_cycle_as_without_cycles_beside_decisions(seed: 
     for beside in (0, 0), (1, 1), (2, 2), (0, 2):
         folder = tmp_path / "-".join(map(str, beside))
         folder.mkdir()
-        session = Session(CONFIGS["cia402"], folder, "unix", quiet=True)
-        quiet_of(session).cycles_beside = beside
+        session = Session(CONFIGS["cia402"], folder, "unix", compiled=True)
+        caller_of(session).cycles_beside = beside
         if beside == (0, 2):
             budget = session.loop._decision_budget
             budget.note = lambda _, budget=budget: setattr(budget, "ns", chance.randrange(2_000_000))  # type: ignore[method-assign, misc]

@@ -21,22 +21,22 @@ _CALL = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
 """Type of a C function whose arguments are the address and the number of consecutive rows of a PackedFrames."""
 
 
-class LentFrames(FrameIO, Protocol):
-    """Access to a bus that Python can lend to compiled code for some time."""
+class SharedFrames(FrameIO, Protocol):
+    """Access to a bus for Python and compiled code, which uses it only while Python does not."""
 
     @property
     def access(self) -> BusAccess:
         """Bus access for compiled code."""
 
-    def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take back `number` received frames from compiled code, which has handled only the first `handled` frames.
+    def put_back(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
+        """Put frames back that compiled code has received: `number`, of which it has handled the first `handled`.
 
         `receive` returns the remaining frames, and then raises `error` (errno.h) unless `error` is 0.
         """
 
 
-def lendable_frames(frames: FrameIO) -> LentFrames:
-    """Return access that can be lent to compiled code: the socket of the bus, unless every frame must be captured."""
+def shared_frames(frames: FrameIO) -> SharedFrames:
+    """Return access for compiled code as well: the socket of the bus, unless every frame must be captured."""
     return frames if isinstance(frames, SocketFrames) and not frames.captured else FrameCalls(frames)
 
 
@@ -47,9 +47,9 @@ class FrameCalls:
         self._frames = frames
         self._last_received: list[Received] = []
         """Frames from the last receiving call."""
-        self._returned: deque[Received] = deque()
+        self._put_back: deque[Received] = deque()
         self._failure: BaseException | None = None
-        """Exception raised while receiving, to be raised again after the returned frames."""
+        """Exception raised while receiving, to be raised again after the frames that were put back."""
         self._refusal: BaseException | None = None
         """Exception raised while sending, to be raised again by the next `send`."""
         self._calls = _CALL(self._receive_all), _CALL(self._send_all)
@@ -65,8 +65,8 @@ class FrameCalls:
 
     def receive(self, timeout: float = 0.0) -> Received | None:
         """Return the next frame that has arrived or arrives within `timeout` [s]; otherwise None."""
-        if self._returned:
-            return self._returned.popleft()
+        if self._put_back:
+            return self._put_back.popleft()
         if self._failure is not None:
             error, self._failure = self._failure, None
             raise error
@@ -76,9 +76,9 @@ class FrameCalls:
         """Restrict the received identifiers; see FrameIO."""
         self._frames.set_identifiers(identifiers)
 
-    def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:  # noqa: ARG002 - frames and error are kept here
-        """Take back the frames of the last receiving call; `receive` returns all except the first `handled` frames."""
-        self._returned.extend(self._last_received[handled:number])
+    def put_back(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:  # noqa: ARG002 - frames and error are kept here
+        """Put back the frames of the last receiving call; `receive` returns all except the first `handled` frames."""
+        self._put_back.extend(self._last_received[handled:number])
 
     def _receive_all(self, address: int, most: int) -> int:
         frames = self._last_received = []

@@ -101,7 +101,7 @@ class SocketFrames:
         self._filtered = filtered
         self._fd = fd
         self._packet = bytearray(CANFD_FRAME.size)
-        self._returned: deque[Received] = deque()
+        self._put_back: deque[Received] = deque()
         self._error = 0
         self._poll = select.poll()
         self._poll.register(carrier, select.POLLIN)
@@ -117,8 +117,8 @@ class SocketFrames:
 
     def receive(self, timeout: float = 0.0) -> Received | None:
         """Return the next frame that has arrived or arrives within `timeout` [s]; otherwise None."""
-        if self._returned:
-            return self._returned.popleft()
+        if self._put_back:
+            return self._put_back.popleft()
         if timeout > 0.0:
             self._poll.poll(timeout * 1000.0)
         packet = self._packet
@@ -157,12 +157,12 @@ class SocketFrames:
         """Bus access for compiled code: the socket."""
         return BusAccess(self._socket.fileno())
 
-    def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take back frames from compiled code, which has handled only the first `handled` frames.
+    def put_back(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
+        """Put frames back that compiled code has received: `number`, of which it has handled the first `handled`.
 
         `receive` returns the remaining frames, and then raises `error` (errno.h) unless `error` is 0.
         """
-        self._returned.extend(arrived.unpacked(handled, number))
+        self._put_back.extend(arrived.unpacked(handled, number))
         self._error = error
 
     def _receive_timed(self, capture: Capture) -> int:

@@ -11,7 +11,7 @@ import can
 
 from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.can_frame import ERROR, EXTENDED_BITS
-from trirail_drivers.bus.frame_calls import lendable_frames
+from trirail_drivers.bus.frame_calls import shared_frames
 from trirail_drivers.bus.frame_io import frame_io
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
@@ -58,7 +58,7 @@ class Wire:
         self.traffic = 0
         """Duration of all frames sent and received, each with worst-case stuffing [ns]."""
         self._frames_ns = timing.frames_ns
-        self._frames = lendable_frames(frame_io(bus))
+        self._frames = shared_frames(frame_io(bus))
         self.fault: DriveFault | None = None
         self._stop = stop
         self._handlers: dict[int, tuple[Listener, Handler]] = {}
@@ -127,7 +127,7 @@ class Wire:
     def _use(self, bus: can.BusABC) -> None:
         """Replace the bus."""
         self.bus = bus
-        self._frames = lendable_frames(frame_io(bus))
+        self._frames = shared_frames(frame_io(bus))
         self._frames.set_identifiers(self._handlers)
 
     def lose(self, reason: str, *, dead: bool = True) -> None:
@@ -175,9 +175,9 @@ class Wire:
         sends = not self._unsent and self._unsent_cycles == 0
         return self.fault is None and not self._warnings and not self.down and sends
 
-    def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take back frames that compiled code has received; see frame_calls.LentFrames."""
-        self._frames.return_frames(arrived, handled, number, error)
+    def put_back(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
+        """Put frames back that compiled code has received but not handled; see frame_calls.SharedFrames."""
+        self._frames.put_back(arrived, handled, number, error)
 
     def warn(self, text: str) -> None:
         """Add a warning; the same warning is added only once between resets."""

@@ -27,8 +27,7 @@ from trirail_drivers.cia402.one_drive import HAS_POWER, SetUp, Start
 from trirail_drivers.cia402.other_masters import OtherMasters
 from trirail_drivers.cia402.returning import ReturningCia402
 from trirail_drivers.config import NO_IO, DigitalIo
-from trirail_drivers.driver.axis_row import NO_OFFSET, NOTHING_SENT
-from trirail_drivers.driver.cyclic import Cyclic
+from trirail_drivers.driver.axis_row import NOTHING_SENT
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.driver.row_updates import (
@@ -74,7 +73,7 @@ class Cia402(Driver[Cia402Axis]):
             )
         ]
         self._pack_frames()
-        self._heartbeat_due: float | None = None
+        self._times.beat_period = drives.heartbeat
         self._wanted: canopen_frames.TargetState = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
         self._requested_after = 0
@@ -158,8 +157,8 @@ class Cia402(Driver[Cia402Axis]):
 
     def _pack_frames(self) -> None:
         """Create the tables of the frames to send; digital outputs have frames if a drive has its outputs in a PDO."""
-        tables, packed = self._tables, partial(packed_frames, fd=self._timing.fd)
-        tables.begin, tables.beats = packed([self._sync]), packed(self._beats)
+        tables, packed = self.tables, partial(packed_frames, fd=self._timing.fd)
+        tables.begin, tables.beats, self._times.beats = packed([self._sync]), packed(self._beats), len(self._beats)
         tables.setpoints = packed([axis.exchange.setpoints.frame() for axis in self._axes])
         tables.end = tables.setpoints.headers
         outputs = [Frame(axis.exchange.outputs or 0, bytes(canopen_frames.OUTPUTS.size)) for axis in self._axes]
@@ -198,19 +197,19 @@ class Cia402(Driver[Cia402Axis]):
         now = self._synced = self._clock()
         self._begin_cycle(now)
         self._wire.receive(now)
-        if self._heartbeat_due is None:
+        if math.isnan(self._times.beat_due):
             # Watchdog times count from the first cycle, however long ago the set-up was.
-            self._heartbeat_due = now
+            self._times.beat_due = now
             for axis in self._axes:
                 axis.status_heard = now
                 axis.heard = now if axis.exchange.heard else math.inf
-        self._begin(now, self._heartbeat_due)
+        self._send_cycle_start(now)
 
-    def _begin(self, now: float, heartbeat_due: float, sent: int = 0) -> None:
+    def _send_cycle_start(self, now: float, sent: int = 0) -> None:
         """Send SYNC and due heartbeats, except the first `sent` of these frames, which are already on the bus."""
         frames_due = [self._sync]
-        if now >= heartbeat_due:
-            self._heartbeat_due = now + self._drives.heartbeat
+        if now >= self._times.beat_due:
+            self._times.beat_due = now + self._times.beat_period
             frames_due += self._beats
         for frame in frames_due[sent:]:
             self._wire.send(frame)
@@ -223,7 +222,7 @@ class Cia402(Driver[Cia402Axis]):
         self._wire.receive(now)
         for axis in self._axes:
             if self._wire.down:
-                axis.lose(stopping=self._off_deadline != math.inf)
+                axis.lose(stopping=self._times.off_deadline != math.inf)
             mistaken = axis.end_cycle()
             end_reading(axis)
             if self._wire.fault is not None and axis.present:
@@ -293,7 +292,7 @@ class Cia402(Driver[Cia402Axis]):
         late = self._clock() - self._synced > self._period
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._command()  # if frames have to wait, stop commands are sent first
-        frames = self._tables.setpoints
+        frames = self.tables.setpoints
         for axis, frame, metres, rate in zip(self._axes, frames.frames, position, velocity, strict=True):
             if not axis.configured:
                 continue
@@ -330,8 +329,8 @@ class Cia402(Driver[Cia402Axis]):
             if not (outputs_pending(axis) and axis.present):
                 continue
             if by_pdo:
-                put_outputs(axis, self._tables.outputs.frames[number, DATA_AT:])
-                if self._wire.send(self._tables.outputs.frame(number)) and not silent:
+                put_outputs(axis, self.tables.outputs.frames[number, DATA_AT:])
+                if self._wire.send(self.tables.outputs.frame(number)) and not silent:
                     note_outputs(axis)
             elif axis.unanswered or self._is_being_configured(axis):  # a server handles one request at a time (CiA 301)
                 continue
@@ -358,46 +357,31 @@ class Cia402(Driver[Cia402Axis]):
         while any(axis.unanswered for axis in asked) and (left := deadline - self._clock()) > 0:
             self._wire.wait(left, self._clock)
 
-    def lend(self) -> Cyclic | None:
-        """Return the tables if all drives are in their target states and nothing is pending, otherwise None."""
-        due = self._heartbeat_due
-        if due is None or not (self._wire.is_healthy and self._homing.idle) or self._period == 0.0:
-            return None
-        if self._stopped_in_this_cycle:
-            return None
+    def prepare_tables(self) -> bool:
+        """Return True if all drives are in their target states and nothing is pending; see driver.cyclic."""
+        if math.isnan(self._times.beat_due) or not (self._wire.is_healthy and self._homing.idle):
+            return False
+        if self._period == 0.0 or self._stopped_in_this_cycle:
+            return False
         for axis in self._axes:
             wanted = _target_of(axis, self._wanted)
             # A drive without power that misses PDOs is sent commands again, also by SDO.
             axis.missed_limit = self._drives.missed_positions if wanted is PowerState.OPERATION_ENABLED else 1
             if not axis.is_steady(wanted):
-                return None
+                return False
         by_sdo = [axis for axis in self._axes if axis.has_outputs and not axis.maps_outputs]
         if any(outputs_pending(axis) or axis.unanswered for axis in by_sdo):  # a lost request is sent again
-            return None
-        lent, beats = self._tables, len(self._beats)
-        lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NO_OFFSET, *lent.counts
+            return False
         states = [(axis.statusword, axis.inputs) for axis in self._axes]
         if states != self._expected_state:
             self._expected_state = states
-            lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected_rows(number)])
-        return lent
-
-    def reclaim(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
-        """Continue from the tables; see trirail_drivers.driver.cyclic.Lender."""
-        times = self._tables.times[0]
-        self._heartbeat_due = float(times["beat_due"])
-        self._wire.return_frames(self._tables.arrived, handled, arrived, error)
-        feedback = self._feedback()
-        if synced is not None:
-            self._synced = synced
-            if times["begun"] != NO_OFFSET:
-                self._begin(synced, self._heartbeat_due, int(times["begun"]))
-        return feedback
+            self.tables.expect([row for number, axis in enumerate(self._axes) for row in axis.expected_rows(number)])
+        return True
 
     def send_on(self, first: int) -> None:
         """Send the setpoints in the tables one at a time, from drive `first` on, and then the changed outputs."""
         for number, axis in enumerate(self._axes[first:], first):
-            axis.setpoints_lost += not self._wire.send(self._tables.setpoints.frame(number))
+            axis.setpoints_lost += not self._wire.send(self.tables.setpoints.frame(number))
         self._send_outputs()
 
     def enable(self, alone: str | None = None) -> None:
@@ -409,7 +393,7 @@ class Cia402(Driver[Cia402Axis]):
         if self._wire.fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
         self._wanted = PowerState.OPERATION_ENABLED
-        self._off_deadline = math.inf
+        self._times.off_deadline = math.inf
         for axis in self._axes:
             axis.powered_up = axis.has_followed = False
             axis.mode.shown = axis.exchange.mode_shown

@@ -8,6 +8,15 @@ from typing import Any, Final
 
 import numpy as np
 
+_KINDS: Final[dict[str, Any]] = {"float": ctypes.c_double, "int": ctypes.c_int64, "bool": ctypes.c_bool}
+
+
+def set_fields(structure: type[ctypes.Structure], **kinds: Any) -> None:
+    """Make the annotated attributes of a structure its fields. `kinds` has the C types of further annotations."""
+    types = _KINDS | kinds
+    structure._fields_ = [(name, types[kind]) for name, kind in inspect.get_annotations(structure).items()]
+
+
 NO_OFFSET: Final = -1
 """Offset that marks a value that a frame does not contain."""
 NOTHING_SENT: Final = -1
@@ -78,7 +87,7 @@ class AxisRow(ctypes.Structure):
     inputs: int
     """Newest digital inputs: bits of 60FDh, limited to the mask."""
 
-    # Constant while cycles are quiet.
+    # Constant while compiled code runs the cycles.
     floats: bool
     """Whether positions are 32-bit floats; otherwise they are integers."""
     waits: bool
@@ -104,7 +113,7 @@ class AxisRow(ctypes.Structure):
     status_within: float
     """Largest age of `status_heard` [s]."""
     missed_limit: int
-    """Number of consecutive unanswered SYNCs from which a cycle is no longer quiet."""
+    """Number of consecutive unanswered SYNCs from which Python must run the cycle."""
     position_at: int
     """Offset of the position in the setpoint frame [bytes]."""
     velocity_at: int
@@ -119,7 +128,6 @@ class AxisRow(ctypes.Structure):
     """Bits of 60FEh:01 outside the mask, sent unchanged since set-up; used for a drive without a mask 60FEh:02."""
 
 
-_KINDS: Final[dict[str, Any]] = {"float": ctypes.c_double, "int": ctypes.c_int64, "bool": ctypes.c_bool}
-AxisRow._fields_ = [(name, _KINDS[kind]) for name, kind in inspect.get_annotations(AxisRow).items()]
+set_fields(AxisRow)
 AXIS: Final = np.dtype(AxisRow)
 """AxisRow as a numpy type, for compiled code."""

@@ -16,12 +16,22 @@ from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.driver.axis import Axis
-from trirail_drivers.driver.cyclic import Cyclic
+from trirail_drivers.driver.axis_row import NO_OFFSET
+from trirail_drivers.driver.cyclic import FINISHED, Cyclic, UnfinishedCycle
 from trirail_drivers.driver.recovery import AnyAxis, Recovery
 from trirail_drivers.driver.refusals import SetUpDrive, merge_notes
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError
-from trirail_drivers.interface import NAMES, Clock, Counts, DriveFault, MissingProtection, Unready, UnreadyDrives
+from trirail_drivers.interface import (
+    NAMES,
+    Clock,
+    Counts,
+    DriveFault,
+    Feedback,
+    MissingProtection,
+    Unready,
+    UnreadyDrives,
+)
 from trirail_drivers.timing import BusTiming
 
 Result = TypeVar("Result")
@@ -55,9 +65,10 @@ class Driver(ABC, Generic[AnyAxis]):
         self._timing = timing
         self._drives = drives
         self._clock = clock
-        self._tables = Cyclic(self._wire.access, history, timing)
+        self.tables = Cyclic(self._wire.access, history, timing)
+        self._times = self.tables.timing
         self._axes = tuple(
-            axis.in_row(self._tables.axes, number, name, drive.node, scale_of(name, drive), drives)
+            axis.in_row(self.tables.axes, number, name, drive.node, scale_of(name, drive), drives)
             for number, (name, drive) in enumerate(zip(NAMES, drives.each, strict=True))
         )
         for each, digital in zip(self._axes, io, strict=True):
@@ -69,10 +80,8 @@ class Driver(ABC, Generic[AnyAxis]):
         self.next_sync = math.inf
         self._synced = 0.0
         """Start of the cycle [s]."""
-        self._off_deadline = math.inf
-        """Time by which the drives must be without power [s]; inf if no such deadline is set."""
         self._stop_reason = ""
-        """Command that set `_off_deadline`."""
+        """Command that set the deadline by which the drives must be without power."""
         self._closed = False
 
     def _warn_of_setup(self, made: Sequence[SetUpDrive]) -> None:
@@ -131,7 +140,7 @@ class Driver(ABC, Generic[AnyAxis]):
             return
         self._steps_left_out = 0
         if self._wire.carries:
-            self._recovery.step(self._synced, stopping=self._off_deadline != math.inf)
+            self._recovery.step(self._synced, stopping=self._times.off_deadline != math.inf)
         else:
             self._recovery.abandon()
 
@@ -151,7 +160,7 @@ class Driver(ABC, Generic[AnyAxis]):
     @property
     def traffic(self) -> int:
         """Duration of all frames sent and received since the start, with worst-case bit stuffing [ns]."""
-        return self._wire.traffic + int(self._tables.times[0]["traffic"])
+        return self._wire.traffic + self._times.traffic
 
     @property
     def counts(self) -> tuple[Counts, Counts, Counts]:
@@ -163,6 +172,20 @@ class Driver(ABC, Generic[AnyAxis]):
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
         """For each drive, the first fault that it has reported itself since the last reset, or None."""
         return tuple(axis.event for axis in self._axes)
+
+    def continue_in_python(self, newest: UnfinishedCycle = FINISHED) -> Feedback:
+        """Continue after compiled cycles; see trirail_drivers.driver.cyclic.CompiledDrives."""
+        self._wire.put_back(self.tables.arrived, newest.handled, newest.arrived, newest.error)
+        feedback, begun = self._feedback(), self._times.begun
+        if newest.synced is not None:
+            self._synced = newest.synced
+        if begun != NO_OFFSET:
+            self._times.begun = NO_OFFSET
+            self._send_cycle_start(self._synced, begun)
+        return feedback
+
+    def send_on(self, first: int) -> None:
+        """Send the setpoints in the tables again; by default do nothing, if the next `sync` sends the setpoints."""
 
     def close(self) -> None:
         """Remove power from the drives, and close the bus.
@@ -188,6 +211,14 @@ class Driver(ABC, Generic[AnyAxis]):
     @abstractmethod
     def sync(self) -> None:
         """Begin a cycle; see trirail_drivers.interface.DriveGroup."""
+
+    @abstractmethod
+    def _send_cycle_start(self, now: float, sent: int = 0) -> None:
+        """Send the frames at the start of a cycle, except the first `sent` frames, which are already on the bus."""
+
+    @abstractmethod
+    def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
+        """Return the present feedback."""
 
     @abstractmethod
     def quick_stop(self) -> None:
@@ -253,8 +284,8 @@ class Driver(ABC, Generic[AnyAxis]):
 
     def _begin_cycle(self, now: float) -> None:
         """Begin a cycle on the bus, and store the access to the bus in the tables, since the bus may be a new one."""
-        self._wire.begin(now, stopping=self._off_deadline != math.inf)
-        self._tables.bus[:] = self._wire.access
+        self._wire.begin(now, stopping=self._times.off_deadline != math.inf)
+        self.tables.bus[:] = self._wire.access
         self.next_sync = math.inf
 
     @property
@@ -271,17 +302,18 @@ class Driver(ABC, Generic[AnyAxis]):
             self.quick_stop()
 
     def _start_stop_timer(self, reason: str) -> None:
-        self._off_deadline, self._stop_reason = self._clock() + self._drives.stop_timeout, reason
+        self._times.off_deadline, self._stop_reason = self._clock() + self._drives.stop_timeout, reason
 
     def _check_stopped(self, now: float) -> None:
         """Latch a fault for the first drive that has power `stop_timeout` after it should have none. Only its brake can
         stop it. The time also runs for a drive that has got power without a command.
         """
-        if self._off_deadline == math.inf and self._powered() and not self._wants_power() and not self._power_reported:
+        times, unwanted = self._times, self._powered() and not self._wants_power()
+        if times.off_deadline == math.inf and unwanted and not self._power_reported:
             self._start_stop_timer("it got power by itself")
-        if now < self._off_deadline:
+        if now < times.off_deadline:
             return
-        self._off_deadline = math.inf
+        times.off_deadline = math.inf
         self._abandon_stop()
         for axis in self._axes:
             fault = axis.stop_overdue_fault(self._stop_reason, self._drives.stop_timeout)

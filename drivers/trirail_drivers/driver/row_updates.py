@@ -1,6 +1,6 @@
 """Updates of one drive's row and of its frames that every cycle makes, written once for both ways in which cycles run.
 
-Drivers call these functions with an AxisRow. Quiet cycles compile the same functions and call them with a row of an
+Drivers call these functions with an AxisRow. Compiled cycles compile the same functions and call them with a row of an
 array of AXIS; see trirail_drivers.driver.cyclic. A function may therefore use only the fields of AxisRow, arrays and
 arithmetic, and call no other function of this file.
 """

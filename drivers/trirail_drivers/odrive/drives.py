@@ -22,8 +22,6 @@ import can
 from trirail_drivers import config
 from trirail_drivers.bus.reopening import Reopening
 from trirail_drivers.config import NO_IO, DigitalIo
-from trirail_drivers.driver.axis_row import NO_OFFSET
-from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.driver.row_updates import count_sync, due_setpoint, end_reading
@@ -31,7 +29,7 @@ from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import cansimple, setup
 from trirail_drivers.odrive.axis import RESET_TIME, OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
-from trirail_drivers.odrive.lending import CycleTableWriter
+from trirail_drivers.odrive.cycle_tables import CycleTableWriter
 from trirail_drivers.odrive.other_masters import listen_for_masters
 from trirail_drivers.odrive.protections import describe_protection
 from trirail_drivers.odrive.returning import ReturningOdrive
@@ -82,11 +80,10 @@ class Odrive(Driver[OdriveAxis]):
         listen_for_masters(self._wire, self._axes)
         self._requests = tuple(cansimple.request(axis.node, cansimple.GET_ENCODER_ESTIMATES) for axis in self._axes)
         self._error_requests = tuple(cansimple.request(axis.node, cansimple.GET_ERROR) for axis in self._axes)
-        self._next_request = 0
-        self._errors_due: float | None = None
+        self._times.beats, self._times.beat_period = 1, cansimple.ERROR_PERIOD
         self._enabled = False
-        self._table_writer = CycleTableWriter(self._tables, self._axes, self._error_requests, self._requests)
-        self._setpoints = SetpointSender(self._axes, self._tables.setpoints, self._wire, drives.quick_stop_deceleration)
+        self._table_writer = CycleTableWriter(self.tables, self._axes, self._error_requests, self._requests)
+        self._setpoints = SetpointSender(self._axes, self.tables.setpoints, self._wire, drives.quick_stop_deceleration)
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:  # noqa: ARG002
         """Check the drives and prepare them, without power, for a cycle of `period` seconds. `fastest` is not used.
@@ -131,18 +128,18 @@ class Odrive(Driver[OdriveAxis]):
         """
         now = self._synced = self._clock()
         self._begin_cycle(now)
-        if self._errors_due is None:
+        if math.isnan(self._times.beat_due):
             # Time-outs count from the first cycle, however long ago the set-up was.
-            self._errors_due = now
+            self._times.beat_due = now
             for axis in self._axes:
                 axis.heard = now
                 axis.clear_missed()
         self._wire.receive(now)
-        self._send_cycle_start(now, self._errors_due)
+        self._send_cycle_start(now)
 
-    def _send_cycle_start(self, now: float, errors_due: float, sent: int = 0) -> None:
+    def _send_cycle_start(self, now: float, sent: int = 0) -> None:
         """Send the frames at the beginning of a cycle, except the first `sent` frames, which are already on the bus."""
-        history = self._tables.history
+        history = self.tables.history
         history[(self._axes[0].syncs + 1) % len(history)] = [axis.sent for axis in self._axes]
         sent -= self._setpoints.step(self._enabled, sent)
         self._request_states()
@@ -150,13 +147,14 @@ class Odrive(Driver[OdriveAxis]):
             if number >= sent:
                 self._wire.send(request)
             count_sync(axis)
-        if now >= errors_due:
-            self._errors_due = now + cansimple.ERROR_PERIOD
-            axis = self._axes[self._next_request]
+        times = self._times
+        if now >= times.beat_due:
+            times.beat_due = now + times.beat_period
+            axis = self._axes[times.next_beat]
             if now < axis.reset_until:  # sent again, since a command may be lost
                 self._clear_errors(axis)
-            self._wire.send(self._error_requests[self._next_request])
-            self._next_request = (self._next_request + 1) % len(self._error_requests)
+            self._wire.send(self._error_requests[times.next_beat])
+            times.next_beat = (times.next_beat + 1) % len(self._error_requests)
 
     def read(self) -> Feedback:
         """Handle every frame that has arrived, and return the feedback."""
@@ -209,34 +207,17 @@ class Odrive(Driver[OdriveAxis]):
             for axis in self._axes:
                 axis.setpoints_late += 1
 
-    def lend(self) -> Cyclic | None:
-        """Return the tables if all drives are in their target states and nothing is pending, otherwise None."""
-        due, sender = self._errors_due, self._setpoints
-        if due is None or not self._wire.is_healthy or sender.stopping:
-            return None
+    def prepare_tables(self) -> bool:
+        """Return True if all drives are in their target states and nothing is pending; see driver.cyclic."""
+        sender = self._setpoints
+        if math.isnan(self._times.beat_due) or not self._wire.is_healthy or sender.stopping:
+            return False
         if self._enabled and not (sender.sent and sender.written):
-            return None
+            return False
         if not all(axis.is_steady(self._target_state(axis)) for axis in self._axes):
-            return None
-        times, requests = self._tables.times, (1, self._next_request)
-        times[0] = self._off_deadline, due, cansimple.ERROR_PERIOD, *requests, NO_OFFSET, *self._tables.counts
+            return False
         self._table_writer.fill(follow=self._enabled, within=self._drives.following_error)
-        return self._tables
-
-    def reclaim(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
-        """Continue from the tables; see trirail_drivers.driver.cyclic.Lender."""
-        times = self._tables.times[0]
-        self._errors_due, self._next_request = float(times["beat_due"]), int(times["next_beat"])
-        self._wire.return_frames(self._tables.arrived, handled, arrived, error)
-        feedback = self._feedback()
-        if synced is not None:
-            self._synced = synced
-            if times["begun"] != NO_OFFSET:
-                self._send_cycle_start(synced, self._errors_due, int(times["begun"]))
-        return feedback
-
-    def send_on(self, first: int) -> None:
-        """Do nothing, since the next `sync` sends the setpoints."""
+        return True
 
     def enable(self, alone: str | None = None) -> None:
         """Begin to power up all drives, or only the drive `alone`, after the next `sync` has sent setpoints.
@@ -247,7 +228,7 @@ class Odrive(Driver[OdriveAxis]):
             return
         self._enabled = True
         self._setpoints.begin()
-        self._off_deadline = math.inf
+        self._times.off_deadline = math.inf
         for axis in self._axes:
             axis.powered_up = False
             axis.left_out = alone not in (None, axis.name)
@@ -329,7 +310,7 @@ class Odrive(Driver[OdriveAxis]):
             fault = axis.find_fault(now, self._enabled and not axis.left_out)
             if fault is not None:
                 return fault
-            due = due_setpoint(axis, self._tables.history[:, number])
+            due = due_setpoint(axis, self.tables.history[:, number])
             if math.isnan(due) or not (self._enabled and axis.powered_up):
                 continue
             error = due - axis.position

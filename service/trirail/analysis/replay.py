@@ -206,7 +206,7 @@ def _batch(entries: Sequence[ControlInput], planner: _RecordedPlanner | LocalPla
 
 
 class _Ahead:
-    """Decisions that the control made while further cycles ran, see trirail.processes.quiet_cycles.
+    """Decisions that the control made while further cycles ran, see trirail.processes.cycle_caller.
 
     The control then knew the feedback before these cycles, and its decisions took effect after them.
     """

@@ -57,7 +57,7 @@ TimedInput = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
 
 
 class SteadyState(NamedTuple):
-    """State from which the compiled call can run quiet cycles, that is, cycles without Python."""
+    """State from which the compiled call can run compiled cycles, that is, cycles without Python."""
 
     run: Run | None
     """Motion from which the setpoints are computed; None if the robot is not executing a motion."""

@@ -96,7 +96,7 @@ class MeasuredState:
 
     @property
     def position(self) -> Triple:
-        """Latest positions of the sliders [m]. In quiet cycles, this property is up to date, but `feedback` is not."""
+        """Latest positions of the sliders [m]. Up to date in compiled cycles, unlike `feedback`."""
         x, y, z = self.numbers["position"][0].tolist()
         return x, y, z
 

@@ -245,7 +245,7 @@ def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, no
         monitored = len(history) and math.isfinite(axis.follows_within)
         if monitored and not abs(_due_setpoint(axis, history[:, i]) - axis.position) <= axis.follows_within:
             return False
-    if not now < times[0].due:
+    if not now < times[0].off_deadline:
         return False
     for i in range(3):
         _end_reading(axes[i])

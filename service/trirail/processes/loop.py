@@ -7,18 +7,18 @@ import time
 from collections.abc import Callable, Iterable, Iterator, MutableSequence
 
 from trirail_drivers.bus.capture import Capture
-from trirail_drivers.driver.cyclic import Lender
+from trirail_drivers.driver.cyclic import CompiledDrives
 from trirail_drivers.interface import NAMES, DriveFault, DriveGroup, Feedback
 
 from trirail.config import Config
 from trirail.control.control import Control, TimedInput
 from trirail.control.modes import ModeEvent
 from trirail.processes.clock import Overruns, PollSet, Suspensions, Tick, Ticker
+from trirail.processes.cycle_caller import CallResult, CycleCaller, DecisionRequest
+from trirail.processes.cycle_core import MOST_AHEAD, Reached
 from trirail.processes.ending import MAX_SHUTDOWN_S, stops_within
 from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
-from trirail.processes.quiet import MOST_AHEAD, Reached
-from trirail.processes.quiet_cycles import DecisionRequest, QuietCycles, QuietResult
 from trirail.processes.reports import EVENTS_KEPT, Reports
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.packets import (
@@ -75,7 +75,7 @@ class Loop:
         *,
         capture: Capture | None = None,
         lacking: tuple[str, ...] = (),
-        quiet: bool = True,
+        compiled: bool = True,
         suspensions: Suspensions | None = None,
         now: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -85,7 +85,7 @@ class Loop:
         ----------
         lacking
             Real-time rights that the loop could not acquire, which it reports in its welcome.
-        quiet
+        compiled
             True if the compiled call runs the cycles without events, False if Python runs every cycle.
         suspensions
             Detector of suspensions of the computer; None for one with the computer's own clocks.
@@ -115,16 +115,16 @@ class Loop:
         self._work: Callable[[], None] | None = None
         """Work that is due beside the next cycles."""
         self._decision_budget = TimeBudget(DECISION_BUDGET_NS, MOST_AHEAD * self._period_ns)
-        self._quiet: QuietCycles | None = None
-        if quiet and isinstance(drives, Lender):
+        self._caller: CycleCaller | None = None
+        if compiled and isinstance(drives, CompiledDrives):
             shared = self._reports, heartbeats, ports.gateway, PollSet(ports), watch, self._urgent_flag
-            self._quiet = QuietCycles(self.control, drives, *shared, config.loop.busy_wait_ns, self._decide_ahead)
+            self._caller = CycleCaller(self.control, drives, *shared, config.loop.busy_wait_ns, self._decide_ahead)
         self._decided_after = 0
         """Cycle after which the newest decision has taken effect."""
         self._fault: DriveFault | None = None
         self._unready: tuple[str, ...] = ()
         self._marked_ns = 0
-        self._parts_ns: MutableSequence[int] = [0] * len(Part) if self._quiet is None else self._quiet.parts_ns
+        self._parts_ns: MutableSequence[int] = [0] * len(Part) if self._caller is None else self._caller.parts_ns
 
     def run(self, ticker: Ticker) -> None:
         """Run cycles until `ending` is set, and then until the drives have lost power or report that they keep it."""
@@ -142,26 +142,26 @@ class Loop:
         self.control.start(self._drives.read())
 
     @property
-    def quiet_cycles(self) -> int:
+    def compiled_cycles(self) -> int:
         """Number of cycles run by the compiled call."""
-        return self._quiet.cycles if self._quiet is not None else 0
+        return self._caller.cycles if self._caller is not None else 0
 
     def turn(self, ticker: Ticker) -> None:
         """Run cycles without events in compiled code, or one cycle with an event in Python; then handle requests."""
-        quiet, newest = self._quiet, None
+        caller, newest = self._caller, None
         disturbed = self.ending or self._gateway.frozen or not self._planner.idle or self._suspensions.occurred()
-        if quiet is not None and not disturbed:
+        if caller is not None and not disturbed:
             work, self._work = self._work, None
-            newest = quiet.run(ticker, self._overruns, self._decision_budget.ns + HANDOVER_NS, work)
-        elif quiet is not None:
-            quiet.leave()
+            newest = caller.run(ticker, self._overruns, self._decision_budget.ns + HANDOVER_NS, work)
+        elif caller is not None:
+            caller.continue_in_python()
         if newest is None:
             if self._work is not None:
                 self._work()
                 self._work = None
             self.cycle(ticker.wait())
-        elif quiet is not None and newest.ahead is not None:
-            self._finish_ahead(quiet, ticker, newest, newest.ahead)
+        elif caller is not None and newest.ahead is not None:
+            self._finish_ahead(caller, ticker, newest, newest.ahead)
         elif newest.reached is Reached.WAITED:
             self.cycle(ticker.tick())
         elif newest.reached is Reached.SYNCED:
@@ -169,19 +169,19 @@ class Loop:
             self._continue_after_sync(newest.tick)
         elif newest.reached in (Reached.OBSERVED, Reached.SOLVED):
             self._continue_solved(newest)
-        elif quiet is not None:
-            self._follow_up(quiet, newest)
+        elif caller is not None:
+            self._follow_up(caller, newest)
 
-    def _follow_up(self, quiet: QuietCycles, newest: QuietResult) -> None:
+    def _follow_up(self, caller: CycleCaller, newest: CallResult) -> None:
         """Decide before the next tick, if that is due after a complete cycle."""
         next_ns = newest.deadline_ns + self._period_ns
         decides = newest.called or newest.decides or self._reports.misses_recorder
         if decides:
             began_ns = self._now()
-            quiet.conclude(newest)
+            caller.conclude(newest)
             self._decide(next_ns, called=newest.called, due=newest.decides)
             self._decision_budget.note(self._now() - began_ns)
-            quiet.add(Part.DECIDE)
+            caller.add(Part.DECIDE)
         self._send_beside(reports=decides)
 
     def _send_beside(self, *, reports: bool) -> None:
@@ -208,15 +208,15 @@ class Loop:
         self._pass_to_control(self._noted(next_ns))
         self._decision_budget.note(self._now() - request.requested_ns)
 
-    def _finish_ahead(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
+    def _finish_ahead(self, caller: CycleCaller, ticker: Ticker, newest: CallResult, last: int) -> None:
         """Let a decision take effect that was made beside the newest cycles, after cycle `last`."""
-        self._finish_beside(quiet, ticker, newest, last)
+        self._finish_beside(caller, ticker, newest, last)
         self._drives.next_sync = (ticker.deadline_ns + self._period_ns) * 1e-9
         self.control.modes.send_commands()
         self.control.end_ahead()
         self._send_beside(reports=True)
 
-    def _finish_beside(self, quiet: QuietCycles, ticker: Ticker, newest: QuietResult, last: int) -> None:
+    def _finish_beside(self, caller: CycleCaller, ticker: Ticker, newest: CallResult, last: int) -> None:
         """Finish the cycles beside which the control has decided, up to cycle `last`, if they have needed Python.
 
         They go on with the motion from before the decision. A fault or a quick stop ends them, even if the decision has
@@ -225,9 +225,9 @@ class Loop:
         reached, tick, done = newest.reached, newest.tick, newest.cycle
         self._marked_ns = newest.marked_ns
         if reached is not Reached.DONE:
-            quiet.leave_at(reached)
+            caller.pass_on_frames(reached)
         if reached is Reached.WRITTEN:
-            quiet.send_on()
+            caller.send_on()
         while reached in (Reached.OBSERVED, Reached.SOLVED) or done < last:
             if reached not in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED):
                 tick = ticker.tick() if reached is Reached.WAITED else ticker.wait()
@@ -235,13 +235,13 @@ class Loop:
                 reached = Reached.SYNCED
             if reached is Reached.SYNCED:
                 if self.control.state.mode is Mode.FAULT or self._quick_stop_waits():
-                    self._end_ahead(quiet, done)
+                    self._end_ahead(caller, done)
                     self._continue_after_sync(tick)
                     return
                 feedback = self._drives.read()
                 self._mark(Part.READ)
                 if feedback.fault is not None:
-                    self._end_ahead(quiet, done)
+                    self._end_ahead(caller, done)
                     self._handle_urgent(self._watch(tick, feedback), tick.deadline_ns + tick.lateness_ns)
                     self.control.execute(feedback, self._mark)
                     self._end(tick)
@@ -250,18 +250,18 @@ class Loop:
                 before = self.control.measured.feedback
                 self._mark(Part.MODE)
                 # Warnings are reported below, and only once.
-                reached = quiet.solve(feedback._replace(warnings=()), tick, self._marked_ns)
-                quiet.copy_measured_back()
+                reached = caller.solve(feedback._replace(warnings=()), tick, self._marked_ns)
+                caller.copy_measured_back()
                 self.control.report_feedback(before, feedback)
-            if quiet.is_refused(reached):
-                self._end_ahead(quiet, done)
-                self._continue_solved(quiet.result(reached))
+            if caller.is_refused(reached):
+                self._end_ahead(caller, done)
+                self._continue_solved(caller.result(reached))
                 return
-            self._marked_ns = quiet.marked_ns
-            self._drives.write(*quiet.setpoints)
+            self._marked_ns = caller.marked_ns
+            self._drives.write(*caller.setpoints)
             self._mark(Part.WRITE)
-            done, reached = quiet.record(self._overruns), Reached.DONE
-        quiet.copy_measured_back()
+            done, reached = caller.record(self._overruns), Reached.DONE
+        caller.copy_measured_back()
 
     def _quick_stop_waits(self) -> bool:
         """Return True if the gateway has sent a quick stop; other stops wait until they can brake the new motion."""
@@ -269,15 +269,15 @@ class Loop:
             self._gateway.read(URGENT_REQUESTS_A_CYCLE)
         return self._gateway.has_quick_stop
 
-    def _end_ahead(self, quiet: QuietCycles, done: int) -> None:
+    def _end_ahead(self, caller: CycleCaller, done: int) -> None:
         """Let the control continue after cycle `done`, although its decisions were to take effect later."""
-        quiet.copy_back()
+        caller.copy_back()
         self.control.ahead = 0
         self.control.return_to(done)
         self._reports.note(self._now(), DecidedAhead(0))
         self.control.modes.send_commands()
 
-    def _continue_solved(self, newest: QuietResult) -> None:
+    def _continue_solved(self, newest: CallResult) -> None:
         """Run the rest of a cycle whose feedback has been evaluated, and end the cycle."""
         self._marked_ns = newest.marked_ns
         code = newest.code if newest.reached is Reached.SOLVED else None
@@ -351,8 +351,8 @@ class Loop:
     def _pass_to_control(self, inputs: Iterable[TimedInput]) -> None:
         self.control.decide(inputs)
         self._decided_after = self.control.cycles
-        if self._quiet is not None:
-            self._quiet.decided = True
+        if self._caller is not None:
+            self._caller.decided = True
 
     def _send_reports(self) -> None:
         """Send events and answers, and receive the recorder's messages."""

@@ -90,7 +90,7 @@ class _Rehearsal:
         self._heartbeats = Heartbeats.create()
         # Python runs each cycle, because only Python code needs the rehearsal. The memory pages of compiled code are
         # all loaded in its first cycle.
-        self._loop = Loop(config, self._drives, self._ports, self._heartbeats, quiet=False, now=lambda: self._now_ns)
+        self._loop = Loop(config, self._drives, self._ports, self._heartbeats, compiled=False, now=lambda: self._now_ns)
         self._planner_link = links.connect(folder / "planner")
         self._planner = MotionPlanner(config)
         self._gateway: PacketLink | None = None

@@ -15,7 +15,7 @@ from trirail_drivers.interface import DriveGroup, UnreadyDrives
 from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes.clock import Tick
-from trirail.processes.quiet import MOST_AHEAD
+from trirail.processes.cycle_core import MOST_AHEAD
 from trirail.wire.decoding import INVALID
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.links import Port

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-import inspect
 from collections.abc import MutableSequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from trirail_drivers.driver.axis_row import set_fields
 
 from trirail.wire.records import Part
 
@@ -21,7 +21,7 @@ Span = tuple[float, float, float]
 """Values of a trirail.motion.runs.GoalSpan."""
 
 
-class QuietState(ctypes.Structure):
+class CycleState(ctypes.Structure):
     """State of the compiled call; the Python attributes are views of the memory that compiled code uses."""
 
     # The tick
@@ -70,7 +70,7 @@ class QuietState(ctypes.Structure):
 
     # The motion
     source: int
-    """Source of the setpoints: FOLLOW, HOLD or COMMAND of trirail.processes.quiet."""
+    """Source of the setpoints: FOLLOW, HOLD or COMMAND of trirail.processes.cycle_core."""
     held: bool
     """Argument of trirail.control.cycle.follow."""
     step: float
@@ -152,15 +152,12 @@ class QuietState(ctypes.Structure):
     """Number of cycles from the first row of the log to its report."""
 
 
-_KINDS: Final[dict[str, Any]] = {
-    "float": ctypes.c_double,
-    "int": ctypes.c_int64,
-    "bool": ctypes.c_bool,
-    "Unsigned": ctypes.c_uint64,
-    "PartTimes": ctypes.c_int32 * len(Part),
-    "Pair": ctypes.c_double * 2,
-    "Span": ctypes.c_double * 3,
-}
-QuietState._fields_ = [(name, _KINDS[kind]) for name, kind in inspect.get_annotations(QuietState).items()]
-STATE: Final = np.dtype(QuietState)
-"""QuietState as a numpy type, for compiled code."""
+set_fields(
+    CycleState,
+    Unsigned=ctypes.c_uint64,
+    PartTimes=ctypes.c_int32 * len(Part),
+    Pair=ctypes.c_double * 2,
+    Span=ctypes.c_double * 3,
+)
+STATE: Final = np.dtype(CycleState)
+"""CycleState as a numpy type, for compiled code."""

@@ -1,4 +1,4 @@
-"""Tables of a quiet cycle with three ODrives; see trirail_drivers.driver.cyclic.
+"""Tables of a compiled cycle with three ODrives; see trirail_drivers.driver.cyclic.
 
 A cycle begins with the setpoints of the previous cycle, if the drives follow setpoints, and with the position requests.
 Every ERROR_PERIOD it also requests the errors of one drive. Nothing is sent at the end of a cycle.

@@ -86,7 +86,7 @@ class Session:
 
     begins_ns = 100_000_000_000
 
-    def __init__(self, config: Config, folder: Path, carrier: str, *, quiet: bool) -> None:
+    def __init__(self, config: Config, folder: Path, carrier: str, *, compiled: bool) -> None:
         self.now_ns = self.begins_ns
         self.config = config
         self.folder = folder
@@ -123,7 +123,7 @@ class Session:
         self.motion = MotionPlanner(config)
         suspensions = Suspensions(lambda: self.asleep_s)
         clocks: dict[str, Any] = {"suspensions": suspensions, "now": lambda: self.now_ns}
-        self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet, **clocks)
+        self.loop = Loop(config, driver, ports, self.hearts, compiled=compiled, **clocks)
         self.loop.begin()
         self.ticker = Ticker(round(config.period * 1e9), lambda: self.now_ns, self.sleep)
         self.heard: list[object] = []
@@ -381,25 +381,25 @@ def both_ways(
     cycles: int,
     carrier: str = "unix",
 ) -> Session:
-    """Run a session with quiet cycles, and once more with every cycle run by Python: the same to the last bit.
+    """Run a session with compiled cycles, and once more with every cycle run by Python: the same to the last bit.
 
-    Frames on the bus, records and events; and many cycles were quiet, so there was something to compare.
+    Frames on the bus, records and events; and many cycles were compiled, so there was something to compare.
     """
     sessions = []
-    for quiet in (True, False):
-        place = folder / str(quiet)
+    for compiled in (True, False):
+        place = folder / str(compiled)
         place.mkdir()
-        session = Session(config, place, carrier, quiet=quiet)
-        if session.loop._quiet is not None:
-            session.loop._quiet.cycles_beside = 0, 0  # Python's cycles know no cycles beside a decision
+        session = Session(config, place, carrier, compiled=compiled)
+        if session.loop._caller is not None:
+            session.loop._caller.cycles_beside = 0, 0  # Python's cycles know no cycles beside a decision
         try:
             session.run(script(), cycles)
         finally:
             session.close()
         sessions.append(session)
     one, other = sessions
-    assert one.loop.quiet_cycles > min(100, cycles // 12)
-    assert other.loop.quiet_cycles == 0
+    assert one.loop.compiled_cycles > min(100, cycles // 12)
+    assert other.loop.compiled_cycles == 0
     assert len(one.heard) > 0.9 * cycles
     _compare(one.heard, other.heard)
     assert one.sent == other.sent
@@ -473,7 +473,7 @@ SENT: Final = {
     "cia402": (0x080, BEAT, 0x301, 0x302, 0x303),
     "odrive": (0x02C, 0x04C, 0x06C, 0x029, 0x049, 0x069, 0x023, 0x043, 0x063),
 }
-"""Identifiers of the frames that are sent in quiet cycles."""
+"""Identifiers of the frames that are sent in compiled cycles."""
 FULL: Final = can.CanOperationError("Transmit buffer full")
 DOWN: Final = OSError(errno.ENETDOWN, "Network is down")
 
@@ -597,7 +597,7 @@ LOSSES = (
 
 def cycles_by_python(session: Session) -> int:
     """Number of cycles that Python has run."""
-    return session.loop.control.cycles - session.loop.quiet_cycles
+    return session.loop.control.cycles - session.loop.compiled_cycles
 
 
 @pytest.mark.parametrize("protocol", CONFIGS)
@@ -751,8 +751,8 @@ def test_two_users_lengthy_goals_are_planned_in_the_same_order(tmp_path: Path, m
     both_ways(CONFIG, tmp_path, lambda: happens, 400)
 
 
-@pytest.mark.parametrize("quiet", [True, False])
-def test_who_stays_at_the_door_unheard_keeps_no_tick_waiting(quiet: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("compiled", [True, False])
+def test_who_stays_at_the_door_unheard_keeps_no_tick_waiting(compiled: bool, tmp_path: Path) -> None:
     """What a frozen gateway has left is not taken, and it stays there."""
 
     def freeze(session: Session) -> None:
@@ -761,7 +761,7 @@ def test_who_stays_at_the_door_unheard_keeps_no_tick_waiting(quiet: bool, tmp_pa
     def leave(session: Session) -> None:
         session.ask(CommandRequest(1, "ann", Command.ENABLE))
 
-    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=quiet)
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", compiled=compiled)
     try:
         session.run({20: [Happening(freeze)], 600: [Happening(leave)]}, 700)
         assert session.loop.control.cycles >= 700
@@ -866,9 +866,9 @@ def test_an_event_belongs_to_the_first_cycle_that_it_shows_in(tmp_path: Path) ->
     assert cycles[-1] > begun[-1]
 
 
-@pytest.mark.parametrize("quiet", [True, False])
-def test_a_recorder_whose_loss_a_batch_notices_is_missed_at_once(quiet: bool, tmp_path: Path) -> None:
-    session = Session(CONFIG, tmp_path, "unix", quiet=quiet)
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_recorder_whose_loss_a_batch_notices_is_missed_at_once(compiled: bool, tmp_path: Path) -> None:
+    session = Session(CONFIG, tmp_path, "unix", compiled=compiled)
 
     def records(session: Session) -> None:
         session.recorder.send(message(Announcement(Notice("service", "info", "recording to x.rrd"))))

@@ -11,7 +11,7 @@ import pytest
 from canopen.objectdictionary import ODVariable
 from control_rig import CONFIG
 from msgspec import structs
-from processes.test_quiet import FULL, Happening, Session, both_ways
+from processes.test_compiled_cycles import FULL, Happening, Session, both_ways
 from trirail.config import Input, Output
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.marks import Mark
@@ -140,7 +140,7 @@ def test_outputs_by_sdo_are_left_to_python(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("by_sdo")
 def test_an_output_by_sdo_whose_request_is_lost_is_sent_again(tmp_path: Path) -> None:
-    session = Session(PINS, tmp_path, "unix", quiet=True)
+    session = Session(PINS, tmp_path, "unix", compiled=True)
     take, lost = session.ends.take, list[bytes]()
 
     def lossy() -> bytes | None:
@@ -165,6 +165,6 @@ def test_an_output_by_sdo_whose_request_is_lost_is_sent_again(tmp_path: Path) ->
         assert isinstance(valve, SimulatedDrive)
         assert len(lost) == 1
         assert [change.bits >> 16 for change in valve.pins.history] == [1]
-        assert session.loop.quiet_cycles > 300
+        assert session.loop.compiled_cycles > 300
     finally:
         session.close()

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from trirail_drivers.driver.cyclic import Cyclic, Lender
+from trirail_drivers.driver.cyclic import FINISHED, CompiledDrives, Cyclic, UnfinishedCycle
 from trirail_drivers.interface import Feedback, Triple
 
 from trirail.control import cycle
@@ -22,12 +22,12 @@ from trirail.control.control import Control, SteadyState
 from trirail.control.feedback import pack_feedback
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run
-from trirail.processes import quiet
+from trirail.processes import cycle_core
 from trirail.processes.clock import Overruns, PollSet, Tick, Ticker
 from trirail.processes.companion import Companion
+from trirail.processes.cycle_core import Reached
+from trirail.processes.cycle_state import STATE, CycleState
 from trirail.processes.heartbeats import PROCESSES, URGENT_INDEX, Heartbeats, UrgentFlag, Watch
-from trirail.processes.quiet import Reached
-from trirail.processes.quiet_state import STATE, QuietState
 from trirail.processes.reports import Reports
 from trirail.wire.links import Port
 from trirail.wire.records import MAX_PART_NS, Part
@@ -38,7 +38,7 @@ _EMPTY_PATH = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
 """Law and path that are passed to compiled code if there is no motion."""
 
 
-class QuietResult(NamedTuple):
+class CallResult(NamedTuple):
     """Result of the compiled call, which describes the newest cycle that the call has begun."""
 
     reached: Reached
@@ -101,17 +101,17 @@ class _Copies:
 
     @property
     def table(self) -> NDArray[np.int64]:
-        """Table of the copies for compiled code, as in trirail.processes.quiet.copy_state."""
+        """Table of the copies for compiled code, as in trirail.processes.cycle_core.copy_state."""
         return np.array(self._rows, np.int64)
 
 
-class QuietCycles:
+class CycleCaller:
     """Caller of the compiled function, with the arrays that this function uses. Call `run` only between two cycles."""
 
     def __init__(
         self,
         control: Control,
-        drives: Lender,
+        drives: CompiledDrives,
         reports: Reports,
         hearts: Heartbeats,
         gateway: Port,
@@ -131,22 +131,23 @@ class QuietCycles:
         self._watch = watch
         self._urgent_flag = urgent_flag
         self._hearts = np.frombuffer(hearts.counts, np.uint64)[: URGENT_INDEX + 1]
-        self._state = QuietState()
+        self._state = CycleState()
         self._moment = np.zeros(2, np.int64)
         self._poll_set = poll_set
-        self._lent: Cyclic | None = None
+        self._prepared = False
+        """True if the drives' tables suffice for the next cycles."""
         self._orders = 0
-        """Number of orders that the control had given to the drives when the drives lent their tables."""
+        """Number of orders that the control had given to the drives when their tables were prepared."""
         self.decided = False
         """True if the control may have changed the motion or the mode since the arguments were prepared."""
         self._steady: SteadyState | None = None
         self._tables: tuple[Any, ...] = ()
         self._motion: tuple[Any, ...] = ()
-        """Arguments of the compiled function, valid until the drives lend other tables or the motion changes."""
+        """Arguments of the compiled function, valid until the tables are prepared again or the motion changes."""
         self._nothing = np.zeros(1)
         self._decide = decide
         self._companion = Companion(self._answer)
-        self.cycles_beside = 1, quiet.MOST_AHEAD
+        self.cycles_beside = 1, cycle_core.MOST_AHEAD
         """Minimum and maximum number of cycles that run beside a decision, which tests change."""
         measured, setpoints = control.measured, control.setpoints
         self._measured, self._commanded, self._furthest = _Copies(), _Copies(), _Copies()
@@ -172,7 +173,7 @@ class QuietCycles:
         overruns: Overruns,
         budget_ns: int,
         work: Callable[[], None] | None = None,
-    ) -> QuietResult | None:
+    ) -> CallResult | None:
         """Run cycles until an event or the end of a batch, and return the result for the newest cycle.
 
         Return None if no cycle was run, because Python must run the next cycle. Otherwise call `conclude` or, if Python
@@ -188,7 +189,7 @@ class QuietCycles:
         """
         control, state = self._control, self._state
         if not (self._reports.idle and self._gateway.no_peer_lost and self._tables_ready()):
-            self.leave()
+            self.continue_in_python()
             if work is not None:
                 work()
             return None
@@ -204,7 +205,7 @@ class QuietCycles:
         if state.requested >= 0:
             return self.result(reached)
         control.outputs.update_log(state.logged, state.report_due)
-        self.leave_at(reached)
+        self.pass_on_frames(reached)
         control.resume(state.cycle, state.time, None)
         if reached is Reached.WRITTEN:
             self.send_on()
@@ -252,32 +253,33 @@ class QuietCycles:
         state.gateway_seen, state.gateway_turns = watch.seen, watch.silent_turns
         state.urgent_seen = self._urgent_flag.seen
         first, moment, *rest = self._tables
-        reached = Reached(quiet.run(first, moment, self._table, self._neighbours(), *rest, *self._motion))
+        reached = Reached(cycle_core.run(first, moment, self._table, self._neighbours(), *rest, *self._motion))
         overruns.all, overruns.in_a_row = state.overruns, state.in_a_row
         watch.seen, watch.silent_turns = state.gateway_seen, state.gateway_turns
         self._reports.batched, ticker.deadline_ns = state.batched, state.deadline_ns
         self.cycles += state.cycle - before
         return reached
 
-    def result(self, reached: Reached) -> QuietResult:
+    def result(self, reached: Reached) -> CallResult:
         """Return the result for the newest cycle, which has reached a stage."""
         state = self._state
         decides = state.decides and reached in (Reached.WRITTEN, Reached.DONE)
         ahead = state.until if state.requested >= 0 else None
         self._drives.next_sync = (state.deadline_ns + state.period_ns) * 1e-9  # for commands at the end of a motion
         tick = state.deadline_ns, state.lateness_ns, state.missed
-        return QuietResult(
+        return CallResult(
             reached, state.cycle, *tick, state.marked_ns, state.called, decides, state.behind, state.code, ahead
         )
 
-    def leave_at(self, reached: Reached) -> None:
-        """Return lent tables to the drives, if the newest cycle has reached a stage that needs Python."""
+    def pass_on_frames(self, reached: Reached) -> None:
+        """Let the drives handle the newest cycle's remaining frames, if it has reached a stage that needs Python."""
         state = self._state
         if reached is not Reached.DONE:
             synced = state.synced if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
-            self.leave(state.handled, state.arrived, synced=synced, error=max(state.error, 0))
+            newest = UnfinishedCycle(state.handled, state.arrived, synced, max(state.error, 0))
+            self.continue_in_python(newest)
 
-    def conclude(self, newest: QuietResult) -> None:
+    def conclude(self, newest: CallResult) -> None:
         """Let the control evaluate the newest cycle, if it must react to that cycle."""
         if newest.decides:
             self._control.resume(newest.cycle, self._state.time, newest.code)
@@ -297,8 +299,8 @@ class QuietCycles:
         self._control.measured.feedback = feedback
         pack_feedback(feedback, self._robot.feedback, self._robot.record)
         first, moment, frames, robot = self._tables
-        reached = quiet.solve(first, moment, frames, robot, self._motion[0])
-        return Reached.SOLVED if reached == quiet.CONTINUE else Reached(reached)
+        reached = cycle_core.solve(first, moment, frames, robot, self._motion[0])
+        return Reached.SOLVED if reached == cycle_core.CONTINUE else Reached(reached)
 
     def is_refused(self, reached: Reached) -> bool:
         """Return True if a following error exceeds its limit, or the last gate has refused the setpoints."""
@@ -320,7 +322,7 @@ class QuietCycles:
         state = self._state
         self._robot.record["outputs"] = self._output_words  # the decision before this cycle may have changed them
         state.overruns, state.batched = overruns.all, self._reports.batched
-        number = int(quiet.record(self._tables[0], self._robot, self._reports.batch))
+        number = int(cycle_core.record(self._tables[0], self._robot, self._reports.batch))
         self._reports.batched = state.batched
         return number
 
@@ -330,50 +332,50 @@ class QuietCycles:
 
         They then execute a motion or hold the robot. Compiled code must not need Python to exchange frames.
         """
-        return self._lent is not None and self._state.source != quiet.FOLLOW and not self._calls_python
+        return self._prepared and self._state.source != cycle_core.FOLLOW and not self._calls_python
 
     @property
     def _calls_python(self) -> bool:
         """True if Python exchanges the frames for compiled code, unless the clock is injected."""
-        return self._state.injected_ns < 0 and (self._lent is None or bool(self._lent.bus[0] < 0))
+        return self._state.injected_ns < 0 and bool(self._drives.tables.bus[0] < 0)
 
     def copy_measured_back(self) -> None:
         """Copy the measured state of the robot back from compiled code."""
-        quiet.copy_state(self._measured_table, True)
+        cycle_core.copy_state(self._measured_table, True)
 
     def copy_back(self) -> None:
         """Copy the whole state of the robot back from compiled code, without the outputs, which it has not changed."""
-        quiet.copy_state(np.concatenate((self._robot_table, self._furthest.table)), True)
+        cycle_core.copy_state(np.concatenate((self._robot_table, self._furthest.table)), True)
 
-    def _neighbours(self) -> quiet.Neighbours:
-        return quiet.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
+    def _neighbours(self) -> cycle_core.Neighbours:
+        return cycle_core.Neighbours(self._poll_set.pollfds, self._hearts, self._reports.batch)
 
-    def leave(self, handled: int = 0, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
-        """Return lent tables to the drives, with the parameters of trirail_drivers.driver.cyclic.Lender.reclaim."""
-        if self._lent is not None:
-            self._control.measured.feedback = self._drives.reclaim(handled, arrived, synced=synced, error=error)
-            self._lent = None
+    def continue_in_python(self, newest: UnfinishedCycle = FINISHED) -> None:
+        """Let the drives continue after compiled cycles."""
+        if self._prepared:
+            self._control.measured.feedback = self._drives.continue_in_python(newest)
+            self._prepared = False
 
     def _tables_ready(self) -> bool:
         """Prepare the arguments of the compiled function. Return False if Python must run the next cycle.
 
-        The drives lend their tables until a decision of the control concerns the drives, and not only the motion.
+        The drives' tables stay as they are until a decision of the control concerns the drives, not only the motion.
         """
-        if self._lent is not None and not self.decided:
+        if self._prepared and not self.decided:
             return True
         self._steady, orders = self._control.steady_state(), self._control.modes.orders
         if self._steady is None:
             return False
         if orders != self._orders:
-            self.leave()
-        if self._lent is None:
-            self._lent, self._orders = self._drives.lend(), orders
-            self._tables = self._table_arguments(self._lent) if self._lent is not None else ()
-        if self._lent is not None:
+            self.continue_in_python()
+        if not self._prepared:
+            self._prepared, self._orders = self._drives.prepare_tables(), orders
+            self._tables = self._table_arguments(self._drives.tables)
+        if self._prepared:
             self._write_state(self._steady)
             self._motion = self._motion_arguments(self._steady.run)
             self.decided = False
-        return self._lent is not None
+        return self._prepared
 
     def add(self, part: Part) -> None:
         """Add the time since the newest cycle to the duration of one of its parts; 0 if a simulated clock is ahead."""
@@ -382,10 +384,10 @@ class QuietCycles:
 
     def _write_state(self, steady: SteadyState) -> None:
         state, run = self._state, steady.run
-        state.source = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
+        state.source = cycle_core.FOLLOW if steady.follows else cycle_core.HOLD if run is None else cycle_core.COMMAND
         state.cycle, state.mode = self._control.cycles, MODES.index(self._control.state.mode)
         state.held, state.at_rest, state.code = steady.held, steady.at_rest, steady.code
-        state.due = int(min(max(steady.until, state.cycle + 1), quiet.NO_CYCLE))
+        state.due = int(min(max(steady.until, state.cycle + 1), cycle_core.NO_CYCLE))
         state.settles, state.timeout = steady.settles_by is not None, steady.settles_by or 0
         runs = self._control.schedule.runs
         state.time = runs[0].time if runs else 0.0
@@ -395,32 +397,32 @@ class QuietCycles:
             if steady.after_stop is not None:
                 state.stop_duration, state.after_stop = run.end_time, steady.after_stop
 
-    def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
-        """Return the arguments of the compiled function that stay the same while the drives lend their tables."""
-        frames = quiet.FrameTables(
-            bus=lent.bus,
-            arrived=lent.arrived.frames,
-            arrivals=lent.arrived.headers,
-            starts=lent.begin.frames,
-            begin=lent.begin.headers,
-            signs=lent.beats.frames,
-            beats=lent.beats.headers,
-            setpoints=lent.setpoints.frames,
-            departures=lent.end,
-            pins=lent.outputs.frames,
-            switchings=lent.outputs.headers,
-            expected=lent.expected,
-            axes=lent.axes,
-            times=lent.times,
-            history=lent.history,
+    def _table_arguments(self, tables: Cyclic) -> tuple[Any, ...]:
+        """Return the arguments of the compiled function that stay the same until the tables are prepared again."""
+        frames = cycle_core.FrameTables(
+            bus=tables.bus,
+            arrived=tables.arrived.frames,
+            arrivals=tables.arrived.headers,
+            starts=tables.begin.frames,
+            begin=tables.begin.headers,
+            signs=tables.beats.frames,
+            beats=tables.beats.headers,
+            setpoints=tables.setpoints.frames,
+            departures=tables.end,
+            pins=tables.outputs.frames,
+            switchings=tables.outputs.headers,
+            expected=tables.expected,
+            axes=tables.axes,
+            times=tables.times,
+            history=tables.history,
         )
         return np.frombuffer(memoryview(self._state), STATE), self._moment, frames, self._robot
 
-    def _robot_arrays(self) -> quiet.RobotArrays:
+    def _robot_arrays(self) -> cycle_core.RobotArrays:
         """Return copies of the control's arrays for compiled code."""
         measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
         record, commanded = self._measured.add(measured.record), self._commanded.add
-        return quiet.RobotArrays(
+        return cycle_core.RobotArrays(
             legs=measured.legs,
             bounds=commanded(setpoints.bounds),
             motion=commanded(schedule.motion),
@@ -436,7 +438,7 @@ class QuietCycles:
             packed=record.view(np.uint8),
         )
 
-    def _motion_arguments(self, run: Run | None) -> tuple[quiet.MotionArrays, quiet.OutputArrays]:
+    def _motion_arguments(self, run: Run | None) -> tuple[cycle_core.MotionArrays, cycle_core.OutputArrays]:
         """Return the arguments of the compiled function that depend on the motion."""
         path, law = (run.path, run.law) if run is not None else (_EMPTY_PATH, _IDLE_LAW)
         self._furthest = _Copies()
@@ -444,5 +446,5 @@ class QuietCycles:
         self._table = np.concatenate((self._robot_table, self._outputs.table, self._furthest.table))
         outputs = self._control.outputs
         outputs.prepare(run, self._control.schedule.version)
-        motion = quiet.MotionArrays(path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest)
-        return motion, quiet.OutputArrays(self._output_state, outputs.planned, self._output_words, outputs.log)
+        motion = cycle_core.MotionArrays(path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest)
+        return motion, cycle_core.OutputArrays(self._output_state, outputs.planned, self._output_words, outputs.log)

@@ -1,4 +1,4 @@
-"""Compiled call that runs cycles without events ("quiet" cycles), one after the other, until Python is needed.
+"""Compiled call that runs cycles without events, one after the other, until Python is needed.
 
 In each cycle, the call wakes up shortly before the tick, receives the frames that answer the previous SYNC, and waits
 for the tick. It sends the SYNC, receives frames and calls `observe`. It then calls `command`, `hold` or `follow`,
@@ -46,8 +46,8 @@ from trirail.processes.cycle_frames import (
     send_outputs,
     set_frames,
 )
+from trirail.processes.cycle_state import STATE
 from trirail.processes.heartbeats import URGENT_INDEX
-from trirail.processes.quiet_state import STATE
 from trirail.wire.records import MAX_PART_NS, Part
 
 MOST_AHEAD: Final = 2
@@ -250,7 +250,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
     s.lateness_ns = now - s.deadline_ns
     s.missed = max(0, s.lateness_ns // s.period_ns)
     t = now / 1e9
-    if (s.in_a_row + s.missed > s.allowed and not s.deciding) or t >= times[0].due:
+    if (s.in_a_row + s.missed > s.allowed and not s.deciding) or t >= times[0].off_deadline:
         return Reached.WAITED
     s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
     s.synced, s.handled, s.arrived = t, 0, 0
