@@ -6,9 +6,8 @@ priority above the loop, to measure the lateness of the machine. The simulated d
 which runs in real time on the other processor, so that a cycle contains only the loop. If a virtual machine stalls one
 of the two processors, the other waits. Faults are counted and reset.
 
-Before and after the service, a bare loop that only exchanges a cycle's frames, as in trirail doctor, runs together with
-cyclictest. The time of the bare loop is the machine's share of the service's time. If the service cannot keep a rate,
-the report says so.
+Before and after the service, a bare loop that only exchanges a cycle's frames runs together with cyclictest. The time
+of the bare loop is the machine's share of the service's time. If the service cannot keep a rate, the report says so.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import bare_loop
 import numpy as np
 from bench_beside import Beside
 from bench_rig import QUANTILES, Rig, quantiles, rig, without_pause
 from numpy.typing import NDArray
 from trirail.client.client import Robot
 from trirail.config import SIM, load
-from trirail.diagnosis import bare_loop
 from trirail.errors import TrirailError
 from trirail.wire.records import PART_NAMES, Part, unpack
 from trirail.wire.vocabulary import Mode
@@ -109,17 +108,17 @@ def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, An
     }
 
 
-def _bare(rate: int, seconds: float, result: Path) -> tuple[bare_loop.Cycles, int]:
+def _bare(rate: int, seconds: float, result: Path) -> tuple[bare_loop.BareCycles, int]:
     """Measure the bare loop in a separate process; return its cycles and the number of ticks that the machine lost."""
     loop = load(SIM).loop
     with ProcessPoolExecutor(1, get_context("spawn"), bare_loop.prepare) as alone:
         alone.submit(os.getpid).result()  # wait until it has compiled the loop
         beside = Beside(seconds, 1_000_000 // rate, loop.priority, result)
-        cycles = alone.submit(bare_loop.measure_alone, loop, rate, seconds).result()
+        cycles = alone.submit(bare_loop.measure, loop, rate, seconds).result()
     return cycles, beside.ticks_lost(beside.lateness())
 
 
-def together(parts: list[tuple[bare_loop.Cycles, int]]) -> dict[str, Any]:
+def together(parts: list[tuple[bare_loop.BareCycles, int]]) -> dict[str, Any]:
     """Return the combined results of all runs of the bare loop, and the total number of ticks that the machine lost."""
     return {
         "cycles": sum(len(cycles.work) for cycles, _ in parts),

@@ -21,11 +21,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import bare_loop
 import bench_linuxcnc
 import numpy as np
 from bench_beside import Beside
 from bench_rig import PROCESSORS, QUANTILES, configured, drives, quantiles, rig, without_pause
-from trirail.diagnosis.bare_loop import BareBus, prepare
+from trirail.diagnosis.bus_timing import BareBus
 from trirail.processes.clock import Ticker
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.unixbus import UnixBus
@@ -144,7 +145,7 @@ def _send_sync(path: str, seconds: float, way: str) -> None:
     import canopen
 
     if way == "bare":
-        prepare()
+        bare_loop.prepare()
     if way != "its own thread":
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -172,7 +173,7 @@ def _send_sync(path: str, seconds: float, way: str) -> None:
 
 
 def _run_bare(bus: UnixBus, seconds: float) -> None:
-    """Send SYNC and three setpoints in the compiled loop of trirail.diagnosis.bare_loop."""
+    """Send SYNC and three setpoints in the compiled loop of trirail.diagnosis.bus_timing."""
     if bus.carrier is None:
         raise SystemExit("the drives have closed the bus")
     setpoints = [Frame(layout.RPDO2 + node, bytes(8)) for node in NODES]

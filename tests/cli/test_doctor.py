@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import subprocess
 import sys
+import tempfile
+import time
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,11 +22,12 @@ from hypothesis import strategies as st
 from trirail.cli import doctor, doctor_cycle, probes
 from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import SIM, Config, Tls, everything, impossible, load
-from trirail.diagnosis import Check, bare_loop, diagnose, drive_checks
-from trirail.diagnosis.bare_loop import Cycles
+from trirail.diagnosis import Check, cycle_timing, diagnose, drive_checks
 from trirail.diagnosis.bus_timing import MeasuredTiming
+from trirail.diagnosis.cycle_timing import Cycles
 from trirail.errors import ServiceError
 from trirail.wire.state import Percentiles
+from trirail_drivers.config import Homing, Simulated
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError
 from trirail_drivers.protocols import PROTOCOLS
@@ -36,9 +40,9 @@ ODRIVE = CONFIGS / "drives/odrive_s1.toml"
 
 
 def cycles(lateness: list[int], work: int, rate: int = 1000) -> Cycles:
-    """Cycles that were so late and took so long [ns]; one position did not come."""
-    late = np.array(lateness, np.int64)
-    return Cycles(late, np.full(len(late), work, np.int64), 1_000_000_000 // rate, 3 * len(late) - 1)
+    """Cycles that were so late and took so long [ns], and 1 µs more with their record; one SYNC was not answered."""
+    late, took = np.array(lateness, np.int64), np.full(len(lateness), work, np.int64)
+    return Cycles(late, took, took + 1000, 1_000_000_000 // rate, 1)
 
 
 # What `ip -details -json link` says of an interface, shortened.
@@ -120,7 +124,7 @@ def test_nothing_is_wrong_with_a_good_machine(config: Config) -> None:
         ({"cycles": cycles([10_000] * 50, 1_100_000)}, "cycle", "failure", "loop.rate_hz = 250"),
         ({"cycles": cycles([10_000] * 50, 90_000_000)}, "cycle", "failure", "no rate can be held"),
         ({"cycles": cycles([0, 11_000_000, 0], 0)}, "cycle", "failure", "isolate"),
-        ({"cycles": "the loop of a service runs there"}, "cycle", "warning", "end that service"),
+        ({"cycles": "the loop of a service runs there; end that service"}, "cycle", "warning", "end that service"),
     ],
 )
 def test_each_fault_of_a_machine_is_named_with_its_remedy(
@@ -198,8 +202,8 @@ def test_a_period_that_is_held_is_told_with_the_highest_rate_that_would_be() -> 
     check = doctor_cycle.cycle(cycles([88_000] * 10, 110_000), REAL)
     assert check.verdict == "ok"
     assert check.found == (
-        "1 kHz: cycle p99.9 110 µs, lateness p99.9 88 µs; setpoints p50 79%, p99.9 79%, worst 79% of the 250 µs that "
-        "the bus leaves: fine; up to 2 kHz"
+        "1 kHz: cycle p99.9 110 µs, with record 111 µs, lateness p99.9 88 µs; setpoints p50 79%, p99.9 79%, worst 79% "
+        "of the 250 µs that the bus leaves: fine; up to 2 kHz"
     )
 
 
@@ -234,6 +238,7 @@ def test_the_numbers_are_those_of_the_samples(lateness: list[int], work: int, ra
     assert found.missed == sum(late * rate // 1_000_000_000 for late in lateness)
     assert found.missed_in_a_row <= found.missed
     assert found.over_us.max == pytest.approx(max(lateness) / 1e3 + work / 1e3)
+    assert found.record_us.max == pytest.approx(work / 1e3 + 1.0)
     assert found.answers_missing == 1
     if found.up_to_hz is not None:
         assert found.over_us.p999 <= doctor_cycle.MAX_PERIOD_SHARE * 1e6 / found.up_to_hz
@@ -430,33 +435,92 @@ def test_without_ip_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.Monk
         probes.link("can0")
 
 
-def test_the_bare_loop_counts_its_cycles_and_what_the_drives_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bare_loop, "BATCH_S", 0.02)
-    shares: list[float] = []
-    found = bare_loop.measure(SIMULATED.loop, 500, 0.1, shares.append)
-    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
-    assert len(found.lateness) == len(found.work) == 50
-    assert found.period == 2_000_000
+@pytest.mark.slow
+@pytest.mark.parametrize("file", ["sim.toml", "socketcan.toml", "drives/odrive_s1.toml"])
+def test_the_services_cycle_is_measured_without_the_configured_bus(file: str) -> None:
+    config, shares = load(CONFIGS / file), list[float]()
+    if config.drives.protocol == "cia402":  # a drive that must be homed is measured as if it were homed
+        homed = msgspec.structs.replace(config.drives.A, homing=Homing(1, 0.1, 0.01, 1.0))
+        config = changed(config, "drives", A=homed)
+    config = changed(changed(config, "loop", realtime="off", rate_hz=200), "can", channel="no_such_bus")
+    found = cycle_timing.measure(config, 0.5, shares.append)
+    assert isinstance(found, Cycles), found
+    assert found.fault == ""
+    assert shares == pytest.approx([0.5, 1.0])
+    assert len(found.lateness) == len(found.work) == len(found.to_record) == 100
+    assert found.period == 5_000_000
     assert all(found.lateness >= 0)
     assert all(found.work > 0)
-    assert 0 < found.answers <= 150
+    assert all(found.to_record >= found.work)
 
 
-def test_an_interrupted_measurement_leaves_no_drives_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[subprocess.Popen[bytes]] = []
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("section", "values", "reason"),
+    [
+        ("can", {"bitrate": 100_000}, "simulated drives: "),
+        (
+            "can",
+            {"simulated": Simulated(start=(9.0, 9.0, 9.0))},
+            "the robot with simulated drives could not be enabled",
+        ),
+    ],
+    ids=["drives", "robot"],
+)
+def test_drives_or_robots_that_do_not_start_are_one_line(
+    section: str, values: dict[str, Any], reason: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    found = cycle_timing.measure(changed(changed(SIMULATED, "loop", realtime="off"), section, **values), 0.1)
+    assert isinstance(found, str)
+    assert found.startswith(reason)
+    assert "\n" not in found
+    assert capfd.readouterr() == ("", "")
+    assert doctor_cycle.cycle(found, SIMULATED).verdict == "warning"
+
+
+def test_a_process_that_ends_early_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cycle_timing, "python", lambda *_: [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"])
+    found = cycle_timing.measure(SIMULATED, 0.1)
+    assert found == "the process that runs the cycles has ended: killed by SIGKILL"
+
+
+@pytest.mark.slow
+def test_an_interrupted_measurement_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[int] = []
 
     class Kept(subprocess.Popen[bytes]):
         def __init__(self, *arguments: Any, **named: Any) -> None:
             super().__init__(*arguments, **named)
-            started.append(self)
+            started.append(self.pid)
 
     def interrupt(_: float) -> None:
+        (process,) = started
+        started.extend(int(each) for each in Path(f"/proc/{process}/task/{process}/children").read_text().split())
         raise KeyboardInterrupt
 
     monkeypatch.setattr(subprocess, "Popen", Kept)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with pytest.raises(KeyboardInterrupt):
-        bare_loop.measure(SIMULATED.loop, 500, 10.0, interrupt)
-    assert [process.returncode for process in started] == [0]
+        cycle_timing.measure(changed(SIMULATED, "loop", realtime="off"), 600.0, interrupt)
+    assert len(started) == 2
+    assert list(tmp_path.iterdir()) == []
+    deadline = time.monotonic() + 30.0
+    while any(is_alive(process) for process in started):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def is_alive(process: int) -> bool:
+    """Whether a process runs; a zombie does not."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def test_a_fault_during_the_measurement_is_a_failure() -> None:
+    check = doctor_cycle.cycle(cycles([0] * 10, 1000)._replace(fault="drive A: frozen"), REAL)
+    assert check.verdict == "failure"
+    assert "the robot stopped: drive A: frozen" in check.found
 
 
 def test_the_governor_of_every_processor_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -558,7 +622,7 @@ def test_a_loop_on_the_same_processor_is_found(tmp_path: Path, monkeypatch: pyte
 def test_beside_a_loop_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probes, "loop_on", lambda cpu: 7)
     config = changed(SIMULATED, "loop", realtime="off", cpu=1)
-    assert probes.machine(config).cycles == "a service's loop, process 7, runs on processor 1"
+    assert str(probes.machine(config).cycles).startswith("a service's loop, process 7, runs on processor 1; end that")
 
 
 def test_a_quick_look_measures_nothing_and_gives_the_rights_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -581,7 +645,8 @@ def test_the_command(json_wanted: bool) -> None:
         assert said["bus_timing"] is None
         if said["cycle"] is not None:  # another service may run here
             assert said["cycle"]["rate_hz"] == 1000
-            assert said["cycle"]["cycles"] == 10_000
+            assert 0 < said["cycle"]["cycles"] <= 10_000  # a stall of the machine may end it by a fault
+            assert said["cycle"]["cycle_us"]["p50"] <= said["cycle"]["record_us"]["p50"]
         assert said["bus"]["rate_hz"] == 1000
         assert said["bus"]["setpoint_bytes"] == 8
         assert (done.returncode == 0) == said["ok"] == ("failure" not in verdicts.values())

@@ -22,9 +22,9 @@ import bench_peers
 import bench_rig
 import numpy as np
 import pytest
+from bare_loop import BareCycles
 from bench_latency import Setpoint
 from bench_rig import QUANTILES, Rig
-from trirail.diagnosis.bare_loop import Cycles
 from trirail.wire.records import PART_NAMES
 
 
@@ -140,7 +140,7 @@ def test_an_aim_is_met_where_no_number_is_greater() -> None:
 
 @pytest.mark.parametrize(("rate", "rows_of_rate"), [(1000, 4), (2000, 2)])
 def test_a_rate_that_is_not_kept_is_said_and_not_met(rate: int, rows_of_rate: int) -> None:
-    cycles = Cycles(np.array([10_000, 600_000]), np.array([20_000, 40_000]), 250_000, 5)
+    cycles = BareCycles(np.array([10_000, 600_000]), np.array([20_000, 40_000]), 250_000, 5)
     bare = bench_loop.together([(cycles, 1), (cycles, 0)])
     assert (bare["cycles"], bare["answers"], bare["missed"], bare["lost_by_the_machine"]) == (4, 10, 4, 1)
     assert bare["cycle"][-1] == 40.0

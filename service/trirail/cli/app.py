@@ -135,7 +135,8 @@ def doctor(
     Exit 1 only if a problem would prevent the robot from running. A CAN interface is checked with the shipped
     configuration for SocketCAN.
 
-    For ten seconds, the command runs cycles that only exchange frames, to measure which rates this machine can hold.
+    For ten seconds, the command runs the service's cycle with simulated drives, to measure which rates this machine can
+    hold. It never uses the configured bus for that.
     On SocketCAN, it then measures for five seconds when the frames of cycles are on the bus: those of a running
     service, or on an idle bus, test frames that no drive uses.
 

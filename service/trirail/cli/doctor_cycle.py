@@ -1,4 +1,4 @@
-"""Evaluation of cycles that only exchange frames: the rates at which this machine can run a loop."""
+"""Evaluation of the measured cycles: the rates at which this machine can run the service's loop."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from msgspec import Struct
 from trirail.cli.terminal import budget_share
 from trirail.config import Config
 from trirail.diagnosis import Check
-from trirail.diagnosis.bare_loop import Cycles, compute_percentiles
 from trirail.diagnosis.bus_timing import MeasuredTiming
+from trirail.diagnosis.cycle_timing import Cycles, compute_percentiles
 from trirail.diagnosis.drive_checks import setpoint_budget_us
 from trirail.wire.state import Percentiles
 
 MAX_PERIOD_SHARE = 0.5
-"""Share of a period within which 999 of 1000 bare cycles must end. The rest is for the service's own computations."""
+"""Share of a period within which 999 of 1000 cycles must send their setpoints. The rest is for decisions."""
 RATES = (100, 250, 500, 1000, 2000)
 """Rates that are evaluated in addition to the configured one [Hz]."""
 
@@ -27,13 +27,15 @@ class HeldRate(Struct, frozen=True):
     """Lateness of the cycles, including the ticks missed before them."""
     cycle_us: Percentiles
     """Time from SYNC to the setpoints."""
+    record_us: Percentiles
+    """Time from SYNC to the end of the record."""
     over_us: Percentiles
-    """Time from the deadline to the end of the cycle, which is the sum of lateness and cycle time for each cycle."""
+    """Time from the deadline to the setpoints, which is the sum of lateness and cycle time for each cycle."""
     missed: int
     """Number of missed ticks."""
     missed_in_a_row: int
     answers_missing: int
-    """Number of positions that were not received, out of three per cycle."""
+    """Number of SYNCs that a drive did not answer, out of three per cycle."""
     up_to_hz: int | None
     """Highest rate that the machine can run; None if it can run none."""
 
@@ -48,10 +50,11 @@ def compute_held_rate(cycles: Cycles) -> HeldRate:
         cycles=len(missed),
         lateness_us=compute_percentiles(cycles.lateness),
         cycle_us=compute_percentiles(cycles.work),
+        record_us=compute_percentiles(cycles.to_record),
         over_us=over,
         missed=sum(missed),
         missed_in_a_row=_longest_streak(missed),
-        answers_missing=3 * len(missed) - cycles.answers,
+        answers_missing=cycles.unanswered,
         up_to_hz=max(held, default=None),
     )
 
@@ -60,16 +63,16 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
     """Check whether the machine can keep the configured period."""
     if isinstance(cycles, str):
         if cycles:
-            return Check(
-                "cycle", "warning", f"not measured: {cycles}", "end that service, then run trirail doctor again"
-            )
+            reason, _, remedy = cycles.partition("; ")
+            return Check("cycle", "warning", f"not measured: {reason}", remedy)
         return Check("cycle", "ok", "not measured: --quick")
     held = compute_held_rate(cycles)
     period = 1e6 / held.rate_hz
     budget = setpoint_budget_us(config)
     summary = (
         f"{_frequency(held.rate_hz)}: cycle p99.9 {held.cycle_us.p999:.0f} µs, "
-        f"lateness p99.9 {held.lateness_us.p999:.0f} µs; setpoints {budget_share(held.over_us, budget)}"
+        f"with record {held.record_us.p999:.0f} µs, lateness p99.9 {held.lateness_us.p999:.0f} µs; "
+        f"setpoints {budget_share(held.over_us, budget)}"
     )
     lost = f"{held.missed} of {held.cycles} ticks missed" if held.missed else ""
     remedy = "see the lines above; end other programs, or isolate a processor"
@@ -80,10 +83,12 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
         return Check(
             "cycle", "failure", f"{summary}: {lost}, {held.missed_in_a_row} in a row, the service would stop", remedy
         )
+    if cycles.fault:
+        return Check("cycle", "failure", f"{summary}: the robot stopped: {cycles.fault}", remedy)
     if held.over_us.p999 > period:
         return Check("cycle", "failure", f"{summary}: the period of {period:.0f} µs is not held, {lost}", remedy)
     if held.over_us.p999 > MAX_PERIOD_SHARE * period:
-        left = f"little of the period of {period:.0f} µs is left for the service" + (f", {lost}" if lost else "")
+        left = f"little of the period of {period:.0f} µs is left for decisions" + (f", {lost}" if lost else "")
         return Check("cycle", "warning", f"{summary}: {left}", remedy)
     if held.over_us.p999 > budget:
         return Check("cycle", "warning", f"{summary}: late setpoints take effect a cycle later", remedy)

@@ -7,8 +7,8 @@ from typing import Any
 from msgspec import Struct
 
 from trirail.cli.key_folder import IssuedCertificate
-from trirail.diagnosis.bare_loop import Cycles
 from trirail.diagnosis.bus_timing import MeasuredTiming
+from trirail.diagnosis.cycle_timing import Cycles
 from trirail.processes.session_guard import Guard
 
 
@@ -52,7 +52,7 @@ class Machine(Struct, frozen=True):
     link: dict[str, Any] | None
     """Properties of the CAN interface, from `ip -details -json link`."""
     cycles: Cycles | str
-    """Timing of cycles that only exchange frames, or the reason why it was not measured; "" if not requested."""
+    """Timing of the service's cycle, or the reason why it was not measured, and the remedy; "" if not requested."""
     traffic: BusTraffic | None = None
     """Traffic on the CAN interface during the measurement."""
     bus_timing: MeasuredTiming | str = ""

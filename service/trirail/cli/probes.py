@@ -25,9 +25,9 @@ from trirail_drivers.timing import BusTiming
 from trirail.cli.key_folder import AUTHORITY_KEY, IssuedCertificate, KeyFolder
 from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import Config, LoopTable
-from trirail.diagnosis import bare_loop, bus_timing
-from trirail.diagnosis.bare_loop import Cycles
+from trirail.diagnosis import bus_timing, cycle_timing
 from trirail.diagnosis.bus_timing import MeasuredTiming
+from trirail.diagnosis.cycle_timing import Cycles
 from trirail.errors import ServiceError
 from trirail.processes import realtime
 from trirail.processes.operating_system import title
@@ -48,22 +48,23 @@ COUNTING_S = 1.0
 def machine(config: Config, *, quick: bool = False, progress: Callable[[float], None] | None = None) -> Machine:
     """Run all probes; `quick` skips the measurement of cycles, and `progress` receives the share of measured cycles.
 
-    This process has the loop's real-time rights only during the probes, so that it does not disturb other programs on
-    the processor afterwards.
+    This process has the loop's real-time rights only while it tries them and while it measures the bus, so that it does
+    not disturb other programs on the processor, such as the measured cycles.
     """
     cpu = realtime.processor(config.loop)
     running = loop_on(cpu)
     measures = not quick and running is None
-    if measures:
-        bare_loop.prepare()
     channel = config.can.channel if config.can.interface == "socketcan" else ""
     before = read_counters(channel)
     cycles: Cycles | str = ""
     with _rights_of(config.loop) as lacking:
-        if measures:
-            cycles = bare_loop.measure(config.loop, config.loop.rate_hz, MEASUREMENT_S, progress)
+        pass  # the measured cycles run in a process of their own, with its own rights
+    if measures:
+        preferring = structs.replace(config, loop=_with_available_rights(config.loop))
+        cycles = cycle_timing.measure(preferring, MEASUREMENT_S, progress)
     if running is not None:
-        cycles = f"a service's loop, process {running}, runs on processor {cpu}"
+        loop = f"a service's loop, process {running}, runs on processor {cpu}"
+        cycles = f"{loop}; end that service, then run trirail doctor again"
     if not measures and before is not None:
         time.sleep(COUNTING_S)
     traffic = traffic_between(before, read_counters(channel))
@@ -275,15 +276,15 @@ def _rights_of(loop: LoopTable) -> Iterator[tuple[str, ...]]:
     """Acquire the loop's rights and processor until the context ends; yield the rights that the loop would lack."""
     allowed, policy, priority = os.sched_getaffinity(0), os.sched_getscheduler(0), os.sched_getparam(0)
     try:
-        yield realtime.acquire(structs.replace(loop, realtime=_available_rights(loop)))
+        yield realtime.acquire(_with_available_rights(loop))
     finally:
         os.sched_setscheduler(0, policy, priority)
         os.sched_setaffinity(0, allowed)
 
 
-def _available_rights(loop: LoopTable) -> Any:
+def _with_available_rights(loop: LoopTable) -> LoopTable:
     # The doctor reports missing rights; with "enforce", the loop refuses to run without them.
-    return "off" if loop.realtime == "off" else "prefer"
+    return loop if loop.realtime == "off" else structs.replace(loop, realtime="prefer")
 
 
 def _has_can() -> bool:

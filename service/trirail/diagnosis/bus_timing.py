@@ -1,6 +1,6 @@
 """Times at which a cycle's frames are on a SocketCAN bus, from the kernel's timestamps of the frames sent here.
 
-If a service runs on the interface, its frames are only listened to. Otherwise, test frames replace them: the bare loop
+If a service runs on the interface, its frames are only listened to. Otherwise, test frames replace them: a bare loop
 sends frames of the same lengths, with identifiers that no drive uses, so that no drive reacts. Nothing is sent on a bus
 that another master may be using.
 """
@@ -16,13 +16,16 @@ from typing import Final, Literal
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.loopback import Loopback, StampedFrame
+from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames, packed_frames
+from trirail_drivers.driver.cyclic import MOST_FRAMES, TIMES
 from trirail_drivers.interface import NAMES
 from trirail_drivers.timing import BusTiming
 
 from trirail.config import LoopTable
-from trirail.diagnosis.bare_loop import BareBus, compute_percentiles, prepare
+from trirail.diagnosis.cycle_timing import compute_percentiles
 from trirail.wire.state import Percentiles
 
 LISTENING_S: Final = 5.0
@@ -46,6 +49,32 @@ which CANSimple does not define. These identifiers are last in arbitration, and 
 """
 
 Source = Literal["service", "test frames"]
+
+
+class BareBus:
+    """Buffers and socket with which trirail.processes.cycle_frames exchanges the frames of a cycle."""
+
+    def __init__(self, descriptor: int, sync: Frame, setpoints: Sequence[Frame]) -> None:
+        """`sync` is sent at the start of each cycle, `setpoints` at its end."""
+        self._bus = np.array(BusAccess(descriptor), np.int64)
+        self._sync, self._setpoints = packed_frames([sync]), packed_frames(setpoints)
+        self._arrived = PackedFrames(MOST_FRAMES)
+        self._times, self._moment = np.zeros(1, TIMES), np.zeros(2, np.int64)
+        nothing = np.zeros(0, np.int64)
+        self.exchange(1, nothing, nothing)  # compiles, so that the first cycle is not delayed
+
+    def exchange(self, period_ns: int, lateness: NDArray[np.int64], work: NDArray[np.int64]) -> int:
+        """Run n cycles, and write their times to `lateness` and `work`, (n,) each [ns].
+
+        Return the number of frames received.
+        """
+        # Imported here, because compiled code takes seconds to load and only a measurement needs it.
+        from trirail.processes.cycle_frames import exchange_frames
+
+        sync, setpoints, arrived = self._sync, self._setpoints, self._arrived
+        sent = sync.headers, sync.frames, setpoints.headers, setpoints.frames
+        memory = arrived.headers, arrived.frames, self._times, self._moment
+        return exchange_frames(self._bus, period_ns, *sent, *memory, lateness, work)
 
 
 class MeasuredTiming(Struct, frozen=True):
@@ -169,7 +198,6 @@ def _send_test_frames(
     share = loop.rate_hz * sum(bus.frame_ns(frame.length) for frame in (sync, *setpoints)) * 1e-9
     if share > 1.0:
         return f"test frames at {loop.rate_hz} Hz would need {share:.0%} of the bus"
-    prepare()
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as carrier:
         carrier.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # this socket only sends
         carrier.bind((channel,))

@@ -1,4 +1,4 @@
-"""Measurement of the best timing that this machine allows, with a bare loop that only exchanges the frames of a cycle.
+"""Bare loop that only exchanges the frames of a cycle, to measure the best timing that this machine allows.
 
 Each cycle waits for an absolute deadline, sends SYNC, reads the frames that have arrived, and sends three setpoints.
 The loop consists of the same compiled functions as the service's cycle. A separate process replaces the drives, on
@@ -13,32 +13,26 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from trirail_drivers.bus.can_frame import CAN_FRAME
-from trirail_drivers.bus.frames import Frame
-from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames, packed_frames
-from trirail_drivers.driver.cyclic import MOST_FRAMES, TIMES
-from trirail_drivers.interface import NAMES
-
 from trirail.config import LoopTable
+from trirail.diagnosis.bus_timing import BareBus
 from trirail.processes import realtime
 from trirail.processes.operating_system import python
-from trirail.wire.state import Percentiles
+from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.frames import Frame
+from trirail_drivers.interface import NAMES
 
-BATCH_S: Final = 0.25
-"""Duration of one call of the compiled loop [s]. Between the calls, Python handles signals and reports progress."""
-_MODULE: Final = "trirail.diagnosis.bare_loop"
 _SYNC, _SETPOINT, _POSITION = 0x080, 0x201, 0x181
 """CAN identifiers of SYNC and of the first node's setpoint and position (CiA 301, predefined connection set)."""
-_DATA: Final = bytes(8)
+_DATA = bytes(8)
 
 
-class Cycles(NamedTuple):
-    """Measured times of n cycles."""
+class BareCycles(NamedTuple):
+    """Measured times of n cycles of the bare loop."""
 
     lateness: NDArray[np.int64]
     """Delay of the start of each cycle, including the ticks missed before the cycle, (n,) [ns]."""
@@ -55,68 +49,27 @@ class Cycles(NamedTuple):
         return self.lateness // self.period
 
 
-class BareBus:
-    """Buffers and socket with which trirail.processes.cycle_frames exchanges the frames of a cycle."""
-
-    def __init__(self, descriptor: int, sync: Frame, setpoints: Sequence[Frame]) -> None:
-        """`sync` is sent at the start of each cycle, `setpoints` at its end."""
-        self._bus = np.array(BusAccess(descriptor), np.int64)
-        self._sync, self._setpoints = packed_frames([sync]), packed_frames(setpoints)
-        self._arrived = PackedFrames(MOST_FRAMES)
-        self._times, self._moment = np.zeros(1, TIMES), np.zeros(2, np.int64)
-
-    def exchange(self, period_ns: int, lateness: NDArray[np.int64], work: NDArray[np.int64]) -> int:
-        """Run n cycles, and write their times to `lateness` and `work`, (n,) each [ns].
-
-        Return the number of frames received.
-        """
-        # Imported here, because compiled code takes seconds to load and only a measurement needs it.
-        from trirail.processes.cycle_frames import exchange_frames
-
-        sync, setpoints, arrived = self._sync, self._setpoints, self._arrived
-        sent = sync.headers, sync.frames, setpoints.headers, setpoints.frames
-        memory = arrived.headers, arrived.frames, self._times, self._moment
-        return exchange_frames(self._bus, period_ns, *sent, *memory, lateness, work)
-
-
 def _frames_of_drives(descriptor: int) -> BareBus:
     return BareBus(descriptor, Frame(_SYNC), [Frame(_SETPOINT + i, _DATA) for i in range(len(NAMES))])
 
 
 def prepare() -> None:
     """Compile the loop, so that the first cycle is not delayed."""
-    none = np.zeros(0, np.int64)
-    _frames_of_drives(0).exchange(1, none, none)
+    _frames_of_drives(0)
 
 
-def measure(loop: LoopTable, rate_hz: int, seconds: float, progress: Callable[[float], None] | None = None) -> Cycles:
-    """Run the bare loop for `seconds` [s] with the present rights of this process.
-
-    `progress` is called with the fraction of the cycles that has been completed.
-    """
-    period = 1_000_000_000 // rate_hz
-    cycles = max(1, round(seconds * rate_hz))
-    lateness, work = np.zeros(cycles, np.int64), np.zeros(cycles, np.int64)
-    answers, each = 0, max(1, round(BATCH_S * rate_hz))
-    prepare()
-    with _drives(loop) as carrier:
-        bus = _frames_of_drives(carrier.fileno())
-        for first in range(0, cycles, each):
-            part = slice(first, min(cycles, first + each))
-            answers += bus.exchange(period, lateness[part], work[part])
-            if progress is not None:
-                progress(part.stop / cycles)
-    return Cycles(lateness, work, period, answers)
-
-
-def measure_alone(loop: LoopTable, rate_hz: int, seconds: float) -> Cycles:
+def measure(loop: LoopTable, rate_hz: int, seconds: float) -> BareCycles:
     """Acquire the real-time rights of the service's loop, and run the bare loop for `seconds` [s].
 
     The process has these rights until it ends.
     """
     prepare()
     realtime.acquire(loop)
-    return measure(loop, rate_hz, seconds)
+    period, cycles = 1_000_000_000 // rate_hz, max(1, round(seconds * rate_hz))
+    lateness, work = np.zeros(cycles, np.int64), np.zeros(cycles, np.int64)
+    with _drives(loop) as carrier:
+        answers = _frames_of_drives(carrier.fileno()).exchange(period, lateness, work)
+    return BareCycles(lateness, work, period, answers)
 
 
 @contextlib.contextmanager
@@ -127,7 +80,7 @@ def _drives(loop: LoopTable) -> Iterator[socket.socket]:
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     processor, priority = realtime.processor(loop), max(1, loop.priority - realtime.DRIVES_BELOW)
-    command = python("-m", _MODULE, *(str(each) for each in (theirs.fileno(), processor, priority)))
+    command = python(__file__, *(str(each) for each in (theirs.fileno(), processor, priority)))
     with ours, subprocess.Popen(command, pass_fds=[theirs.fileno()], start_new_session=True) as process:
         theirs.close()
         try:
@@ -155,11 +108,6 @@ def _answer(carrier: socket.socket, processor: int, priority: int) -> None:
             if frame == sync:
                 for position in positions:
                     carrier.send(position)
-
-
-def compute_percentiles(values: NDArray[Any]) -> Percentiles:
-    """Return the percentiles [µs] of times [ns]."""
-    return Percentiles(*(float(each) / 1e3 for each in np.percentile(values, (50.0, 99.0, 99.9, 100.0))))
 
 
 if __name__ == "__main__":
