@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from trirail.cli import doctor, doctor_cycle, probes
+from trirail.cli import app, doctor, doctor_cycle, probes
 from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import SIM, Config, Tls, everything, impossible, load
 from trirail.diagnosis import Check, cycle_timing, diagnose, drive_checks
@@ -508,6 +508,20 @@ def test_an_interrupted_measurement_leaves_nothing_behind(tmp_path: Path, monkey
     while any(is_alive(process) for process in started):
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+def test_an_interrupted_measurement_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object, **__: object) -> Machine:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(probes, "machine", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        app.doctor()
+    told = capsys.readouterr()
+    assert (told.out, told.err.count("\n")) == ("", 1)
+    assert "the measurement was interrupted" in told.err
 
 
 def is_alive(process: int) -> bool:

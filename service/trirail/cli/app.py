@@ -164,8 +164,12 @@ def doctor(
     read: list[Machine] = []
 
     def machine(config: Config) -> Machine:
-        with terminal.measuring("measuring cycles", show=not quick) as progress:
-            read.append(probes.machine(config, quick=quick, progress=progress))
+        try:
+            with terminal.measuring("measuring cycles", show=not quick) as progress:
+                read.append(probes.machine(config, quick=quick, progress=progress))
+        except KeyboardInterrupt:
+            terminal.print_error("the measurement was interrupted; trirail doctor --quick checks without it")
+            raise
         return read[-1]
 
     checks = run_checks(path, findings, machine)

@@ -7,6 +7,7 @@ drives; the configured bus is never used. All times are those of the records tha
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
@@ -166,6 +167,7 @@ def _connect_simulated(config: Config, path: Path, capture: Capture | None) -> D
 def main(connection: Connection[Any, Any]) -> None:
     """Measure the cycle for the process at the other end, and send it the progress and the times, or the reason."""
     realtime.die_with_parent(signal.SIGKILL)
+    logging.disable()  # the drivers log that they wait for drives
     try:
         for each in _measure(*connection.recv()):
             connection.send(each)
