@@ -381,6 +381,29 @@ def test_curves_begin_anew_after_a_clock_that_was_set_back(page: Page) -> None:
     assert found == sorted(found)
 
 
+def test_the_time_in_which_the_page_was_hidden_is_a_gap(page: Page, robot: FakeRobot) -> None:
+    def rows() -> list[list[float]]:
+        found: list[list[float]] = page.evaluate(f"(async () => {CHARTS}.rows)()")
+        return found
+
+    wait_until(lambda: len(rows()) > 3, "curves")
+    page.evaluate(
+        "(() => { window.hidden = []; window.draw = requestAnimationFrame;"
+        " window.requestAnimationFrame = (each) => hidden.push(each); })()"
+    )
+    page.until("hidden.length")
+    before, robot.pose = len(rows()), (0.02, 0.005, 0.1)
+    page.evaluate(
+        "(() => { for (const clock of [Date, performance]) { const now = clock.now.bind(clock);"
+        " clock.now = () => now() + 60_000; }"
+        " window.requestAnimationFrame = draw; hidden.forEach((each) => draw(each)); })()"
+    )
+    wait_until(lambda: len(rows()) > before + 3, "curves again")
+    drawn = rows()
+    assert drawn[before] == [None] * 7
+    assert [row[0] for row in drawn[before + 1 :]] == pytest.approx([20.0] * len(drawn[before + 1 :]))
+
+
 def test_curves_in_another_unit_are_cleared(page: Page, robot: FakeRobot) -> None:
     wait_until(lambda: page.evaluate(f"(async () => {CHARTS}.rows.length)()") > 3, "curves")
     restart(page, robot, small(robot.told))

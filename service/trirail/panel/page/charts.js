@@ -30,9 +30,10 @@ export class Charts {
   }
 
   // Draw anew, for this robot and in the language of now.
-  robot({ sliders, colours, resolution }) {
+  robot({ sliders, colours, resolution, state_timeout }) {
     if (this.scale !== resolution.scale) this.clear(); // they are in another unit
     this.scale = resolution.scale;
+    this.longest = state_timeout; // between two points of a line [s]
     for (const plot of this.plots) plot.destroy();
     const [x, y, phi] = ["--accent", "--second", "--third"].map(style);
     this.plots = [
@@ -46,6 +47,7 @@ export class Charts {
   state({ pose, sliders, loop }, now) {
     if (now - this.last < EVERY) return;
     this.last = now;
+    if (Date.now() / 1e3 - this.times.at(-1) > this.longest) this.lost(); // the page was hidden, or the machine slept
     this.#add([pose[0] * this.scale, pose[1] * this.scale, pose[2] * PHI, ...sliders.following_error.map((each) => each * 1e6), loop.lateness_us.p99]);
     if (now - this.drawn < DRAWN || byId("charts").hidden) return;
     this.drawn = now;

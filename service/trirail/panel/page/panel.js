@@ -160,7 +160,7 @@ function draw() {
   if (!contact) return;
   document.body.dataset.contact = "yes";
   drawing.show(state);
-  charts.state(state, performance.now());
+  if (!old()) charts.state(state, performance.now()); // a page that was hidden first draws the state of before
   readings.state(state);
   outputs.state(state);
   line.state(state);
@@ -170,8 +170,10 @@ function draw() {
   allow();
 }
 
+const old = () => performance.now() - heard > robot.state_timeout * 1e3;
+
 setInterval(() => {
-  if (contact && drawn && !document.hidden && performance.now() - heard > robot.state_timeout * 1e3) lost("old");
+  if (contact && drawn && !document.hidden && old()) lost("old");
 }, 250);
 
 function lost(why, trouble = "") {
