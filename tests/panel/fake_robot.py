@@ -340,6 +340,9 @@ class AsyncFakeRobot:
     async def __aenter__(self) -> AsyncFakeRobot:
         return self
 
+    async def _twin(self) -> AsyncFakeRobot:
+        return self
+
     async def close(self) -> None:
         self._threads.shutdown(wait=False)
 

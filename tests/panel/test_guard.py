@@ -406,6 +406,26 @@ def test_the_last_override_counts_however_slow_the_answers_are() -> None:
         assert robot.commands == ["override", "pause", "override"]
 
 
+@pytest.mark.parametrize("name", ["stop", "quick_stop", "disable"])
+def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str) -> None:
+    free, held = threading.Event(), threading.Event()
+
+    async def send() -> None:
+        held.set()
+        free.wait()  # as Zenoh's own send does, in the thread of the event loop
+
+    with Panel(FakeRobot().robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+        try:
+            panel._loop.start(send())
+            assert held.wait(WITHIN)
+            opened.send(f'{{"do": "command", "name": "{name}"}}')
+            while f'"done","to":"{name}"' not in str(opened.recv(WITHIN)):
+                pass
+            assert not free.is_set()
+        finally:
+            free.set()
+
+
 REDUCES = {"disable", "stop", "quick_stop", "pause", "release"}
 """Commands that only reduce motion."""
 ACTS: list[dict[str, Any]] = [

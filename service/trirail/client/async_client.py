@@ -125,13 +125,13 @@ class AsyncRobot:
         await shared._use(connection)
         return shared
 
-    async def _twin(self, connection: Connection) -> AsyncRobot:
+    async def _twin(self) -> AsyncRobot:
         """Return a robot for the running event loop that shares the connection and receives no events.
 
         The returned robot can send commands; the handles of its goals would never get a result.
         """
         twin = copy.copy(self)
-        twin._open = AsyncConnection(connection)
+        twin._open = self._connection.another()
         return twin
 
     @property

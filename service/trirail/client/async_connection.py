@@ -36,6 +36,10 @@ class AsyncConnection:
         """Queues from which tasks read."""
         self._closed = False
 
+    def another(self) -> AsyncConnection:
+        """Return another object for the same connection, for the running event loop."""
+        return AsyncConnection(self._connection)
+
     def close(self) -> None:
         """End the calls and iterations of all tasks with a ServiceError. The connection itself stays open."""
         self._closed = True

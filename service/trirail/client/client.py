@@ -169,7 +169,7 @@ class Robot:
         # A call that waits for a congested link blocks the thread of its event loop. Stops run in a second event loop,
         # so that a blocked call cannot delay a stop.
         self._stop_loop = LoopThread()
-        self._stopping = self._stop_loop.call(self._robot._twin(self._connection))
+        self._stopping = self._stop_loop.call(self._robot._twin())
 
     def __enter__(self) -> Self:
         return self

@@ -112,6 +112,10 @@ class Panel:
             opened.callback(self._loop.close)
             self._loop.call(robot.__aenter__())
             opened.callback(lambda: self._loop.call(robot.close()))
+            # As in Robot: a call that waits for a congested link cannot delay a stop in another event loop.
+            self._stop_loop = LoopThread()
+            opened.callback(self._stop_loop.close)
+            self._stopping = self._stop_loop.call(robot._twin())
             self._feed = Feed(robot, self._loop)
             listening = _listen(port)
             self._opened = opened.pop_all()
@@ -124,6 +128,7 @@ class Panel:
             self._serve,
             sock=listening,
             process_request=self._answer,
+            create_connection=_Connection,
             compression=None,  # latency matters more than size
             server_header=None,
             max_size=MAX_MESSAGE,
@@ -148,7 +153,7 @@ class Panel:
         self._opened.close()
 
     def _serve(self, opened: ServerConnection) -> None:
-        Tab(opened, self._robot, self._loop, self._feed).serve()
+        Tab(opened, self._robot, self._loop, self._stopping, self._stop_loop, self._feed).serve()
 
     def _answer(self, opened: ServerConnection, request: Request) -> Response | None:
         """Return the response to a request; None to open the WebSocket."""

@@ -85,10 +85,19 @@ prepare(AnyPageMessage)
 class Tab:
     """Handler of the WebSocket of one tab. When the socket closes, the handler ends the tab's jog and lease.
 
-    A late or lost message does not renew a jog, so the service then brakes the robot.
+    A late or lost message does not renew a jog, so the service then brakes the robot. `stopping` and `stop_loop` are
+    the robot and the event loop for stops.
     """
 
-    def __init__(self, socket: ServerConnection, robot: AsyncRobot, loop: LoopThread, feed: Feed) -> None:
+    def __init__(
+        self,
+        socket: ServerConnection,
+        robot: AsyncRobot,
+        loop: LoopThread,
+        stopping: AsyncRobot,
+        stop_loop: LoopThread,
+        feed: Feed,
+    ) -> None:
         self._socket = socket
         self._feed = feed
         self._robot = robot
@@ -99,7 +108,7 @@ class Tab:
         self._outbox: deque[bytes] = deque(maxlen=MAX_ANSWERS)
         self._undrawn: deque[int] = deque()
         self._uploads = Uploads()
-        self._requests = TabRequests(robot, loop, feed, self._enqueue, self._uploads)
+        self._requests = TabRequests(robot, loop, stopping, stop_loop, feed, self._enqueue, self._uploads)
         self._poses, self._paths = NewestTask("pose check"), NewestTask("path check")
         self._open = True
 

@@ -19,6 +19,7 @@ from trirail.panel.messages import Follow, Forget, SendCommand, SendGoal, Servic
 from trirail.panel.uploads import UploadedFile, Uploads
 from trirail.wire.goals import kind_name
 from trirail.wire.messages import CommandReply
+from trirail.wire.stop_protocol import STOPS
 from trirail.wire.vocabulary import Command
 
 MAX_PENDING = 8
@@ -42,16 +43,29 @@ class MessageSender(Protocol):
 class TabRequests:
     """Sender of the requests of one tab, and holder of the tab's lease.
 
-    `send` is a function that sends the results of the requests to the page. `uploads` contains the tab's file.
+    `stopping` and `stop_loop` are the robot and the event loop for stops. `send` is a function that sends the results
+    of the requests to the page. `uploads` contains the tab's file.
     """
 
-    def __init__(self, robot: AsyncRobot, loop: LoopThread, feed: Feed, send: MessageSender, uploads: Uploads) -> None:
+    def __init__(
+        self,
+        robot: AsyncRobot,
+        loop: LoopThread,
+        stopping: AsyncRobot,
+        stop_loop: LoopThread,
+        feed: Feed,
+        send: MessageSender,
+        uploads: Uploads,
+    ) -> None:
         self._robot = robot
         self._loop = loop
+        self._stopping = stopping
+        self._stop_loop = stop_loop
         self._feed = feed
         self._reply = send
         self._uploads = uploads
         self._pending: Counter[str] = Counter()
+        """Numbers of unanswered requests. Each event loop changes only the numbers of its own requests."""
         self._lease: AsyncLease | None = None
         self._acquiring = asyncio.Lock()
         """Lock that is held while the lease is being acquired, so that the tab never holds two leases."""
@@ -79,7 +93,7 @@ class TabRequests:
         elif kind == Command.OVERRIDE:
             self._loop.start(self._set_override(send))
         else:
-            self._loop.start(self._answer(send, kind, name))
+            (self._stop_loop if kind in STOPS else self._loop).start(self._answer(send, kind, name))
 
     def _prepared(self, request: ServiceRequest) -> tuple[str, str, Callable[[], Awaitable[object]]]:
         """Return the fields `to` and `name` of the result of a request, and the function that sends the request."""
@@ -142,7 +156,7 @@ class TabRequests:
                 if self._lease is not None and self._lease.lost is None:
                     await self._release()
                     return None
-        return await self._robot.command(name, content)
+        return await (self._stopping if name in STOPS else self._robot).command(name, content)
 
     async def _follow(self, file: UploadedFile | None, stretch: bool) -> AsyncGoalHandle:
         if file is None:
