@@ -23,6 +23,7 @@ import zenoh
 from trirail.client import blocking
 from trirail.client.blocking import Jog, Lease, LoopThread
 from trirail.client.client import Robot
+from trirail.client.connection import Connection
 from trirail.errors import ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.goals import Goal, PoseGoal
@@ -153,6 +154,31 @@ def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str, robo
         assert not free.is_set()
     finally:
         free.set()
+
+
+def test_a_stop_that_a_congested_link_holds_up_delays_no_other_stop(
+    robot: Robot, slow: Slow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free, held, post = threading.Event(), threading.Event(), Connection._post
+
+    def hold(self: Connection, query: dict[str, Any], *rest: Any) -> None:
+        if str(query["selector"]).endswith("/stop"):
+            held.set()
+            free.wait()
+        post(self, query, *rest)
+
+    monkeypatch.setattr(Connection, "_post", hold)
+    stopping = Call(robot.stop)
+    try:
+        assert held.wait(WITHIN)
+        quick = Call(robot.quick_stop)
+        reply(slow.next(), CommandReply("quick_stop", "fault", 1))
+        quick.end()
+        assert not free.is_set()
+    finally:
+        free.set()
+    reply(slow.next(), CommandReply("stop", "fault", 2))
+    stopping.end()
 
 
 # ---------------------------------------------------------------------- Ctrl-C

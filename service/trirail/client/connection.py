@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -136,16 +137,27 @@ class Connection:
     def copies(self, stop: StopOrder, deliver: Callable[[Outcome], None]) -> Iterator[Outcomes]:
         """Send a stop over Zenoh and, if there is one, to the stop port; pass the outcome of each copy to `deliver`.
 
-        Any thread may call `deliver`, until the context ends. Yield the collector of the outcomes.
+        Any thread may call `deliver`, until the context ends. Yield the collector of the outcomes. Separate threads
+        send the copies, so that a stop for which a congested link has no room does not delay the next stop.
         """
+        with self.open_session():  # if the session is closed, raise the error here
+            pass
         at_door = stop.at_door(self._connect, self._credentials, lambda outcome: deliver(self._note_sequence(outcome)))
         try:
             query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
-            self._post(query, CommandReply, deliver)
+            threading.Thread(target=self._post_stop, args=(query, deliver), name="stop over Zenoh", daemon=True).start()
             yield Outcomes(2 if at_door is not None else 1)
         finally:
             if at_door is not None:
                 at_door.cancel()
+
+    def _post_stop(self, query: dict[str, Any], deliver: Callable[[Outcome], None]) -> None:
+        try:
+            self._post(query, CommandReply, deliver)
+        except ServiceError as error:
+            deliver(error)
+        except Exception as error:  # noqa: BLE001 - the caller must get an outcome in any case
+            deliver(ServiceError(f"cannot send a stop over Zenoh: {error!r}"))
 
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
