@@ -555,6 +555,18 @@ def test_a_step_is_one_move_for_one_press(
     enabled.let_go(button)
 
 
+def test_a_goal_whose_end_is_not_told_is_no_longer_shown_when_the_robot_has_none(
+    enabled: Page, robot: FakeRobot
+) -> None:
+    """Such as to a tab that was frozen while more happened than the panel keeps."""
+    robot.lasting = True
+    enabled.click("[data-pose=park]")
+    enabled.until("document.querySelector('#answer').textContent.startsWith('go to park')")
+    with robot._lock:
+        robot.goal, robot.mode = None, "holding"
+    enabled.until("document.querySelector('#answer').textContent === ''")
+
+
 def test_a_place_is_kept_and_forgotten_by_its_name(enabled: Page, robot: FakeRobot) -> None:
     enabled.write("#pose-name", "pick")
     enabled.click("#teach")

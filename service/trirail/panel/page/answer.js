@@ -4,6 +4,7 @@ import { onLanguage, say } from "./words.js";
 
 const SHOWN = { done: 8000, refused: 15000 }; // how long a line stays at most [ms]
 const SETTLES = 300; // a command whose state is not known is taken to be shown after so long [ms]
+const LATE = 3000; // a goal whose end is not told has ended if the robot has had no goal for so long [ms]
 const KEPT = 50; // so many ended goals are remembered: an end may be told before the goal is known to be this page's
 const MOTION = ["holding", "moving", "stopping"];
 
@@ -56,6 +57,8 @@ export class Answer {
   state(state) {
     const { line } = this;
     if (line?.kind === "goal") {
+      line.idle = state.goal ? null : (line.idle ?? performance.now());
+      if (!state.goal && performance.now() - line.idle > LATE) return this.clear();
       const begun = state.goal?.id === line.id;
       const waits = !begun || state.mode === "holding" || state.override === 0;
       this.#show(say(waits ? "answer.waits" : "answer.accepted", { what: line.what }));
