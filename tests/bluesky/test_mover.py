@@ -10,7 +10,8 @@ from typing import Any, cast
 import pytest
 from trirail.bluesky import UnfinishedError
 from trirail.bluesky.flight import Flight
-from trirail.bluesky.mover import AxisMove, Mover, setpoint_of
+from trirail.bluesky.mover import AxisMove, Mover, cancel, setpoint_of
+from trirail.client import goal as goal_module
 from trirail.client.async_client import AsyncRobot
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
@@ -64,13 +65,14 @@ class Robot:
         await self.accepts.wait()
         if self.refuses is not None:
             raise self.refuses
-        goal = AsyncGoalHandle(f"g{len(self.goals) + 1}", self._stop, self._answer)
+        goal = AsyncGoalHandle(f"g{len(self.goals) + 1}", self._stop, self._answer, self._answer)
         if self.goals and self.goals[-1].result is None:
             self.end("preempted", -1)
         self.goals.append(goal)
         return goal
 
-    async def _answer(self) -> None: ...
+    async def _answer(self) -> bool:
+        return True
 
     async def _stop(self, *_: object) -> None:
         if self.goals[-1].result is not None:
@@ -145,6 +147,25 @@ def test_a_stop_while_a_goal_is_being_sent_stops_that_and_all_behind_it() -> Non
         await stopping
         assert [await outcome(move) for move in (first, second, third)] == ["stopped", *["TrirailError"] * 2]
         assert robot.targets == [(0.01, 0.0, 0.0)]
+
+    run(work)
+
+
+def test_a_stop_of_a_goal_whose_end_was_missed_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(goal_module, "CHECK_PERIOD_S", 0.01)
+
+    async def is_present() -> bool:
+        return False
+
+    async def confirm(*_: object) -> None: ...
+
+    async def work(robot: Robot, mover: Mover) -> None:
+        move = mover.start({0: 0.01})
+        await until(lambda: len(robot.goals) == 1)
+        vars(robot.goals[0]).update(_missed="events 2 to 1003", _is_present=is_present, _command=confirm)
+        await cancel(robot.goals[0])
+        assert await outcome(move) == "ServiceError"
+        robot.end("stopped")
 
     run(work)
 

@@ -15,6 +15,8 @@ from typing import Any
 import msgspec
 import pytest
 import zenoh
+from panel.fake_robot import FakeRobot
+from trirail.client import goal as goal_module
 from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import GoalHandle, Jog, Lease, Track
 from trirail.client.client import Robot
@@ -24,8 +26,8 @@ from trirail.client.track import AsyncTrack
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import zenoh_session
 from trirail.wire.goals import Goal, VelocityGoal
-from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply
-from trirail.wire.state import State
+from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
+from trirail.wire.state import GoalState, State
 from waiting import WITHIN
 
 
@@ -55,7 +57,7 @@ async def nothing(*_: object) -> Any:
 
 
 TWINS = [
-    (AsyncGoalHandle("g", nothing, nothing), GoalHandle),
+    (AsyncGoalHandle("g", nothing, nothing, nothing), GoalHandle),
     (AsyncJog(nothing, (0.0, 0.0, 0.0), 1.0), Jog),
     (AsyncLease(nothing, force=False, timeout=1.0), Lease),
     (AsyncTrack(nothing, lambda *_: None, "g", 1.0), Track),
@@ -231,6 +233,60 @@ def test_a_goal_is_waited_for_and_cancelling_the_wait_does_not_stop_it(silent: S
     assert silent.asked.empty()
 
 
+@pytest.mark.parametrize("present", [None, "another", "g"])
+def test_a_wait_for_a_goal_whose_end_was_missed_asks_for_the_present_goal(
+    silent: Silent, locator: str, monkeypatch: pytest.MonkeyPatch, present: str | None
+) -> None:
+    """Such as after a loss of the network, during which there were more events than the service keeps."""
+    monkeypatch.setattr(goal_module, "CHECK_PERIOD_S", 0.01)
+    event = Event("service", "info", "x", seq=1, t=0.0, cycle=0, time=5.0, run="r")
+    over = threading.Event()
+    fake = FakeRobot()
+    fake.goal = None if present is None else GoalState(present, 0.5, 1.0)
+
+    def publish_states() -> None:
+        while not over.wait(0.01):
+            silent.publish("state", fake.state())
+
+    def answer_roles() -> None:
+        while not over.is_set():
+            with contextlib.suppress(queue.Empty), silent.asked.get(timeout=0.01) as query:
+                query.reply(query.key_expr, msgspec.json.encode(RoleReply("ann", "maintainer")))
+
+    async def work(robot: AsyncRobot) -> None:
+        sending = asyncio.ensure_future(robot.move_to(x=0.0, y=0.0, phi=0.0, id="g"))
+        await asyncio.to_thread(silent.answer, GoalReply("g", 1.0, run="r"))
+        goal = await sending
+        threads = [asyncio.to_thread(each) for each in (publish_states, answer_roles)]
+        others = asyncio.gather(*threads)
+        for seq in (1, 2):
+            silent.publish("event", msgspec.structs.replace(event, seq=seq))
+        silent.publish("event", msgspec.structs.replace(event, seq=1004))
+        try:
+            if present == "g":
+                while not goal._missed:
+                    await asyncio.sleep(0.01)
+                waits = asyncio.ensure_future(goal.wait())
+                while goal._missed:
+                    await asyncio.sleep(0.01)
+                ended = {"kind": "goal", "id": "g", "outcome": "done", "seq": 1005}
+                silent.publish("event", msgspec.structs.replace(event, **ended))
+                assert (await waits).outcome == "done"
+            else:
+                with pytest.raises(ServiceError, match="has missed events 3 to 1003, and the goal is not in progress"):
+                    await goal.wait()
+                silent.publish("event", msgspec.structs.replace(event, run="next"))
+                while robot._goals:
+                    await asyncio.sleep(0.01)
+                with pytest.raises(ServiceError, match="started again"):
+                    await goal.wait()
+        finally:
+            over.set()
+            await others
+
+    run(locator, work)
+
+
 def test_a_jog_that_is_left_while_it_is_renewed_hears_its_end_and_is_not_stopped(silent: Silent, locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
         jog = robot.jog(x=0.01)
@@ -341,7 +397,7 @@ def test_a_jog_brakes_at_its_end_although_a_renewal_has_failed(error: TrirailErr
             raise error
         return handle
 
-    handle = AsyncGoalHandle("g", nothing, nothing)
+    handle = AsyncGoalHandle("g", nothing, nothing, nothing)
     vars(handle).update(wait=nothing)
 
     async def main() -> AsyncJog:

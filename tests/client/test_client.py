@@ -62,7 +62,9 @@ def noisy(tmp_path: Path) -> Iterator[Robot]:
 
 def unheard(robot: Robot) -> GoalHandle:
     """A goal of which nobody tells anything."""
-    return GoalHandle(AsyncGoalHandle("mine", robot._robot.command, robot._robot.role), robot._loop, robot.command)
+    inner = robot._robot
+    goal = AsyncGoalHandle("mine", inner.command, inner.role, lambda: inner._is_present("mine"))
+    return GoalHandle(goal, robot._loop, robot.command)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import queue
 from collections.abc import Iterator
@@ -13,10 +14,12 @@ import zenoh
 from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from trirail.client.async_client import AsyncRobot
 from trirail.client.connection import Connection, once
+from trirail.client.goal import AsyncGoalHandle
 from trirail.config import SIM, load
 from trirail.processes.order import Order
-from trirail.processes.publications import Publications
+from trirail.processes.publications import EVENTS_KEPT, Publications
 from trirail.wire.messages import Event, Notice
 from waiting import WITHIN, wait_until
 
@@ -54,6 +57,26 @@ def test_a_client_receives_events_that_were_lost_the_last_too(lossy: tuple[zenoh
         for number in range(1, 6):
             published.event(Notice("service", "info", "x").event(number, 1.0, 1, 10.0))
         assert [received.get(timeout=WITHIN).seq for _ in range(5)] == [1, 2, 3, 4, 5]
+
+
+def test_a_goal_that_ends_in_events_that_the_service_no_longer_has_is_marked(
+    lossy: tuple[zenoh.Session, Connection], tmp_path: Path
+) -> None:
+    service, _ = lossy
+    published = Publications(service, "demo", "r")
+
+    async def wait() -> None:
+        async with AsyncRobot("demo", f"unixsock-stream/{tmp_path}/z") as robot:
+            goal = robot._goals.open(AsyncGoalHandle("g", robot.command, robot.role, lambda: robot._is_present("g")))
+            heard = service.declare_publisher("trirail/demo/event")
+            await asyncio.to_thread(wait_until, lambda: matches(heard))
+            for number in range(1, EVENTS_KEPT + 5):
+                published.event(Notice("service", "info", "x").event(number, 1.0, 1, 10.0))
+                if number == 1:
+                    await asyncio.to_thread(wait_until, lambda: robot._newest == {"r": 1})
+            await asyncio.to_thread(wait_until, lambda: goal._missed == "events 2 to 4")
+
+    asyncio.run(wait())
 
 
 def test_no_client_makes_the_gateway_remember_its_heartbeats(lossy: tuple[zenoh.Session, Connection]) -> None:

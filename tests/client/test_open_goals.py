@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
@@ -18,11 +19,12 @@ from trirail.wire.messages import GoalReply
 IDS = ("g1", "g2")
 
 
-def handle(goal_id: str) -> AsyncGoalHandle:
-    async def command(*_: object) -> None:
-        raise AssertionError("nothing was to be commanded")
+async def no_command(*_: object) -> Any:
+    raise AssertionError("nothing was to be commanded")
 
-    return AsyncGoalHandle(goal_id, command, command)
+
+def handle(goal_id: str) -> AsyncGoalHandle:
+    return AsyncGoalHandle(goal_id, no_command, no_command, no_command)
 
 
 def reply(goal_id: str) -> GoalReply:
@@ -124,10 +126,6 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(goal_module, "SILENT_AFTER_S", 0.5)
 
 
-async def no_command(*_: object) -> None:
-    raise AssertionError("nothing was to be commanded")
-
-
 async def hangs() -> None:
     await asyncio.Event().wait()
 
@@ -142,7 +140,7 @@ def test_a_wait_ends_if_the_service_is_silent_and_not_if_it_refuses(error: Excep
         raise error
 
     async def wait() -> None:
-        goal = AsyncGoalHandle("g1", no_command, check)
+        goal = AsyncGoalHandle("g1", no_command, check, no_command)
         if isinstance(error, ServiceError):
             with pytest.raises(ServiceError, match="the end of goal g1 is unknown: no robot answers"):
                 await goal.wait()
@@ -151,6 +149,47 @@ def test_a_wait_ends_if_the_service_is_silent_and_not_if_it_refuses(error: Excep
         assert len(checks) > 1
         goal.end(Result("g1", "done", ""))
         assert (await goal.wait()).outcome == "done"
+
+    asyncio.run(wait())
+
+
+@pytest.mark.usefixtures("hurried")
+@pytest.mark.parametrize("waiting", [False, True], ids=["missed before the wait", "missed during the wait"])
+def test_a_wait_ends_if_the_end_may_have_been_missed_and_not_while_the_goal_is_in_progress(waiting: bool) -> None:
+    present = True
+    asked = asyncio.Event()
+
+    async def is_present() -> bool:
+        asked.set()
+        return present
+
+    async def check() -> None:
+        pass
+
+    async def wait() -> None:
+        nonlocal present
+        goals = OpenGoals()
+        goals.accept(goal := goals.open(AsyncGoalHandle("g1", no_command, check, is_present)), reply("g1"))
+        waits = asyncio.ensure_future(goal.wait())
+        goals.miss(2, 1003)
+        await asked.wait()
+        await asyncio.sleep(0)
+        present = False
+        asked.clear()
+        if waiting:
+            goals.miss(1005, 2006)
+        else:
+            waits.cancel()
+            goals.miss(1005, 2006)
+            waits = asyncio.ensure_future(goal.wait())
+        with pytest.raises(ServiceError, match="goal g1 is unknown: the client has missed events 1005 to 2006"):
+            await waits
+        present = True  # it was queued
+        waits = asyncio.ensure_future(goal.wait())
+        asked.clear()
+        await asked.wait()
+        goals.end(Result("g1", "done", ""))
+        assert (await waits).outcome == "done"
 
     asyncio.run(wait())
 
@@ -169,7 +208,7 @@ def test_a_wait_goes_on_while_the_service_answers_now_and_then(answers: list[boo
             if not answer:
                 raise ServiceError("no robot answers")
 
-        goal = AsyncGoalHandle("g1", no_command, check)
+        goal = AsyncGoalHandle("g1", no_command, check, no_command)
         return await goal.wait()
 
     silent_s = 0.01 * max((len(list(run)) for answer, run in itertools.groupby(answers) if not answer), default=0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +18,7 @@ POSE = 0.0, 0.0, 0.0
 UPDATES = 12
 
 
-async def no_command(*_: object) -> None:
+async def no_command(*_: object) -> Any:
     raise AssertionError("nothing was to be commanded")
 
 
@@ -31,7 +33,7 @@ class Sent:
             finish(self.track.update(POSE))
 
     async def _begin(self, _: object, goal_id: str) -> AsyncGoalHandle:
-        handle = AsyncGoalHandle(goal_id, no_command, no_command)
+        handle = AsyncGoalHandle(goal_id, no_command, no_command, no_command)
         handle.reply = GoalReply(goal_id, None, lag=0.0)
         return handle
 

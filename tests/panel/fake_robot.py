@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 from trirail.client.async_client import AsyncRobot
@@ -48,7 +48,7 @@ STEADY = Percentiles(10.0, 20.0, 30.0, 40.0)
 LOOP = LoopState(1000, 0, 0, STEADY, STEADY, STEADY, 500.0, 0.5, 0.4, ())
 
 
-async def no_command(*_: object) -> None:
+async def no_command(*_: object) -> Any:
     raise AssertionError("nothing was to be commanded")
 
 
@@ -214,7 +214,7 @@ class FakeRobot:
         return NamedPose(name, *self.named.pop(name), taught=True)
 
     def _handle(self, goal_id: str) -> GoalHandle:
-        goal = self._handles.setdefault(goal_id, AsyncGoalHandle(goal_id, no_command, no_command))
+        goal = self._handles.setdefault(goal_id, AsyncGoalHandle(goal_id, no_command, no_command, no_command))
         return GoalHandle(goal, loop(), lambda *_: None)
 
     def command(self, name: str, content: bytes | None = None) -> CommandReply:

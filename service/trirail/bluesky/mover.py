@@ -234,7 +234,8 @@ async def cancel(goal: AsyncGoalHandle) -> None:
     except RefusedError as error:
         if error.code != RefusalCode.NO_GOAL:
             raise
-    with contextlib.suppress(TimeoutError):  # the service reports the end of the goal when the robot is at rest
+    # The robot is at rest, and the service reports the end of the goal, unless that event is late or was missed.
+    with contextlib.suppress(TimeoutError, ServiceError):
         await goal.wait(SILENCE_S)
 
 

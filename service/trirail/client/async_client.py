@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import copy
+import functools
 import uuid
 from collections.abc import AsyncGenerator, Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, AsyncExitStack, aclosing
@@ -83,8 +84,8 @@ class AsyncRobot:
         self._opened = AsyncExitStack()
         self._open: AsyncConnection | None = None
         self._goals = OpenGoals()
-        self._runs: set[str] = set()
-        """Runs of the service from which events have arrived."""
+        self._newest: dict[str, int] = {}
+        """Number of the newest event that has arrived from each run of the service."""
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
@@ -121,7 +122,7 @@ class AsyncRobot:
     async def _shared(self, connection: Connection) -> AsyncRobot:
         """Return a robot for the running event loop that shares the connection but registers its goals separately."""
         shared = copy.copy(self)
-        shared._opened, shared._goals, shared._runs = AsyncExitStack(), OpenGoals(), set()
+        shared._opened, shared._goals, shared._newest = AsyncExitStack(), OpenGoals(), {}
         await shared._use(connection)
         return shared
 
@@ -363,7 +364,8 @@ class AsyncRobot:
         """
         goal_id = id or id_of(make)
         *before, last = goal_messages(make, goal_id)
-        goal = self._goals.open(AsyncGoalHandle(goal_id, self.command, self.role))
+        is_present = functools.partial(self._is_present, goal_id)
+        goal = self._goals.open(AsyncGoalHandle(goal_id, self.command, self.role, is_present))
         try:
             reply = await self._connection.fetch(("goal", self.user), GoalReply, last, before=before)
         except BaseException as error:
@@ -373,6 +375,11 @@ class AsyncRobot:
             raise
         self._goals.accept(goal, reply)
         return goal
+
+    async def _is_present(self, goal_id: str) -> bool:
+        """Return whether a goal is the present goal in the next state."""
+        goal = (await self.state()).goal
+        return goal is not None and goal.id == goal_id
 
     def _stop_unanswered(self, goal_id: str) -> None:
         """Stop a goal whose sender was cancelled, without waiting for a reply."""
@@ -664,9 +671,12 @@ class AsyncRobot:
         return self._open
 
     def _on_event(self, event: Event) -> None:
-        if event.run and event.run not in self._runs:
-            self._runs.add(event.run)
+        if event.run and event.run not in self._newest:
             self._goals.lose_others(event.run)
+        newest = self._newest.get(event.run, event.seq)
+        if event.seq > newest + 1:  # Zenoh delivers events in order, after it has asked for lost events again
+            self._goals.miss(newest + 1, event.seq - 1)
+        self._newest[event.run] = max(event.seq, newest)
         self._goals.note_switches(event.marks)
         if (result := result_of(event)) is not None:
             self._goals.end(result)

@@ -233,7 +233,8 @@ class GoalHandle:
     def wait(self, timeout: float | None = None) -> Result:
         """Wait until the goal ends; return its result. The `outcome` of the result is "done" if the goal succeeded.
 
-        Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues.
+        Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues. Raises ServiceError
+        if the end of the goal is unknown, as in AsyncGoalHandle.wait.
         """
         within = seconds(timeout)
         return self._goal.result or self._loop.call(self._goal.wait(within))

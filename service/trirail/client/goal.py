@@ -65,7 +65,8 @@ class AsyncGoalHandle:
     """Handle of an accepted goal; discarding the handle does not stop the goal.
 
     `command` is a function that sends a command with its content, such as AsyncRobot.command. `check` is a function
-    that raises ServiceError if the service does not answer.
+    that raises ServiceError if the service does not answer. `is_present` is a function that returns whether the goal is
+    the present goal in the state.
     """
 
     def __init__(
@@ -73,15 +74,19 @@ class AsyncGoalHandle:
         goal_id: str,
         command: Callable[[Command, bytes], Awaitable[object]],
         check: Callable[[], Awaitable[object]],
+        is_present: Callable[[], Awaitable[bool]],
     ) -> None:
         self.id = goal_id
         self.reply = GoalReply(goal_id, 0.0)
         """Reply of the service that accepted the goal."""
         self._command = command
         self._check = check
+        self._is_present = is_present
         self._result: Result | None = None
         self._lost = ""
         """Reason why the result will remain unknown."""
+        self._missed = ""
+        """Events that the client has missed, and among which the end of the goal may be; empty if there are none."""
         self._ended = asyncio.Event()
 
     def __repr__(self) -> str:
@@ -118,38 +123,49 @@ class AsyncGoalHandle:
 
         Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues. Raises ServiceError
         if the end of the goal is unknown, because the client is closed before the goal ends, the service does not
-        answer for SILENT_AFTER_S, or the service has started again. After a silence, you may wait again.
+        answer for SILENT_AFTER_S, the client has missed events and the goal is not in progress, or the service has
+        started again. After a silence, and if the goal is still queued, you may wait again.
         """
         within = seconds(timeout)
-        ended, silent = asyncio.create_task(self._ended.wait()), asyncio.create_task(self._wait_for_silence())
+        ended, unknown = asyncio.create_task(self._ended.wait()), asyncio.create_task(self._wait_until_unknown())
         try:
-            await asyncio.wait((ended, silent), timeout=within, return_when=asyncio.FIRST_COMPLETED)
-            if silent.done() and not self._ended.is_set():
-                raise ServiceError(f"the end of goal {self.id} is unknown: {silent.result()}")
+            await asyncio.wait((ended, unknown), timeout=within, return_when=asyncio.FIRST_COMPLETED)
+            if unknown.done() and not self._ended.is_set():
+                raise ServiceError(f"the end of goal {self.id} is unknown: {unknown.result()}")
         finally:
             ended.cancel()
-            silent.cancel()
-            await asyncio.wait((ended, silent))
+            unknown.cancel()
+            await asyncio.wait((ended, unknown))
         if self._result is None and self._ended.is_set():
             raise ServiceError(self._lost)
         if self._result is None:
             raise WaitTimeoutError(f"goal {self.id} has not ended within {within:g} s")
         return self._result
 
-    async def _wait_for_silence(self) -> ServiceError:
-        """Return the error of the check once the service has not answered for SILENT_AFTER_S."""
+    async def _wait_until_unknown(self) -> str:
+        """Return the reason why the end of the goal is unknown, once it is.
+
+        Either the service has not answered for SILENT_AFTER_S, or the end may be among events that were missed.
+        """
         answered = time.monotonic()
         while True:
             await asyncio.sleep(CHECK_PERIOD_S)
             try:
                 await self._check()
+                if self._missed and await self._is_present():
+                    self._missed = ""  # the goal has not ended yet
             except ServiceError as error:
                 if time.monotonic() - answered > SILENT_AFTER_S:
-                    return error
+                    return str(error)
                 continue
             except RefusedError:
                 pass  # a refusal is an answer, too
             answered = time.monotonic()
+            if self._missed:
+                return (
+                    f"the client has missed {self._missed}, and the goal is not in progress; if it is queued, wait "
+                    "again, otherwise it has ended: read its outcome in the service's recording"
+                )
 
     def end(self, result: Result | None, reason: str = CLOSED) -> None:
         """Set the result, which is None if it remains unknown for a `reason`, and wake the tasks that wait for it."""
@@ -212,6 +228,11 @@ class OpenGoals:
             self._switches.pop(goal_id, None)
             handle = self._handles.pop(goal_id)
             handle.end(None, f"the service has started again: the end of goal {goal_id} is unknown")
+
+    def miss(self, first: int, last: int) -> None:
+        """Note that the client has missed the events with the numbers from `first` to `last`."""
+        for handle in self._handles.values():
+            handle._missed = f"events {first} to {last}"
 
     def note_switches(self, switches: Iterable[Switch]) -> None:
         """Store output switches for the results of their goals; ignore switches of goals that are not registered.
