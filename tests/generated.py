@@ -3,7 +3,7 @@
 Hypothesis tests are generated, and so are those that draw from a seed: @pytest.mark.generated(0, 1, 2) on a test with
 an argument `seed` has it run with each of these, or with as many fresh ones. What exploring finds stays: as @example(…)
 of a hypothesis test, as one more seed of the others. --effort=0.1 tries a tenth of the examples, of the seeds and
-of the cases of each test that is marked as long, for `make test`: also these are the same at every run.
+of the cases of each test that is marked as long or many, for `make test`: also these are the same at every run.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             given = test._hypothesis_internal_use_settings
             examples = max(min(FEWEST, given.max_examples), round(given.max_examples * effort))
             test._hypothesis_internal_use_settings = settings(given, max_examples=examples)
-        _thin_long(config, items)
+        _thin(config, items)
     if explore is None:
         return
     kept = [item for item in items if _hypothesis(item) or item.get_closest_marker("generated")]
@@ -106,17 +106,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     _note(config, {"tests": len({item.nodeid.partition("[")[0] for item in kept})})
 
 
-def _thin_long(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out all but a share of the cases of each test that is marked as long, by the effort; one at least."""
-    cases: dict[str, list[pytest.Item]] = {}
+def _thin(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out all but a share of the cases of each test that is marked as long (one at least) or many (FEWEST)."""
+    cases: dict[tuple[str, int], list[pytest.Item]] = {}
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        if "long" in marks and marks.isdisjoint({"core", "alone", "vcan"}):
-            cases.setdefault(item.nodeid.partition("[")[0], []).append(item)
+        if marks & {"long", "many"} and marks.isdisjoint({"core", "alone", "vcan"}):
+            fewest = 1 if "long" in marks else FEWEST
+            cases.setdefault((item.nodeid.partition("[")[0], fewest), []).append(item)
     effort, left_out = config.getoption("effort"), []
-    for each in cases.values():
+    for (_, fewest), each in cases.items():
         each.sort(key=lambda item: zlib.crc32(item.nodeid.encode()))  # no order of theirs, and the same at every run
-        left_out += each[max(1, round(len(each) * effort)) :]
+        left_out += each[max(fewest, round(len(each) * effort)) :]
     config.hook.pytest_deselected(items=left_out)
     gone = set(left_out)
     items[:] = [item for item in items if item not in gone]

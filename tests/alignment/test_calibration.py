@@ -93,6 +93,7 @@ UNEQUAL = {"left": 0.05, "right": 1.0}
 
 
 @pytest.mark.parametrize("noise", [dict.fromkeys(PART, 0.1), UNEQUAL], ids=["equal", "unequal"])
+@pytest.mark.long
 def test_noise_and_deviations_of_each_camera_are_those_of_many_trials(noise: dict[str, float]) -> None:
     stage = two_cameras(0, noise=noise)
     trials = []

@@ -28,6 +28,7 @@ def drawn(shape: MarkShape, turn: float, mirror: float, rng: np.random.Generator
 
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
 @pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.many
 def test_a_code_is_read_in_any_direction_and_placed(family: CodeFamily, mirror: float) -> None:
     rng = np.random.default_rng(4)
     for number in (0, 8, 17):

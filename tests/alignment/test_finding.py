@@ -63,6 +63,7 @@ def test_to_a_twentieth_of_a_pixel_whatever_blur_turn_size_and_light(kind: MarkK
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.long
 def test_with_noise_the_errors_are_of_a_twentieth_of_a_pixel(kind: MarkKind) -> None:
     rng = np.random.default_rng(11)
     errors = []

@@ -167,6 +167,7 @@ def test_lost_swapped_and_wrong_marks_are_named_and_change_nothing(seed: int, na
 @example(name="uvw-ppr", seed=10, off=(1e-3, 5e-3, 0.0))
 @example(name="uvw", seed=107, off=(50e-6, 1e-4, 2e-3))
 @example(name="xxy", seed=11, off=(50e-6, 1e-4, 2e-3))
+@pytest.mark.long
 def test_legs_far_from_their_configuration_leave_no_more_than_the_noise_of_the_pictures(
     name: str, seed: int, off: tuple[float, float, float]
 ) -> None:
@@ -220,6 +221,7 @@ def test_the_fewest_looks_of_one_mark_still_end_with_what_they_determine() -> No
     assert all(math.isfinite(found.deviations[name]) for name in found.deviations.keys() - set(found.undetermined))
 
 
+@pytest.mark.long
 def test_standard_deviations_are_the_scatter_of_repeated_calibrations() -> None:
     corrections, deviations = [], []
     for repeat in range(12):
@@ -349,6 +351,7 @@ def test_impossible_arguments_are_refused_before_a_move(change: dict[str, object
 
 @pytest.mark.parametrize("name", sorted(STAGES))
 @pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.many
 def test_cameras_are_checked_within_the_travel_from_wherever_the_stage_stands(name: str, side: float) -> None:
     made, task = stage(name, 5)
     task = task._replace(approach=(2e-4, 2e-4, 1e-3))

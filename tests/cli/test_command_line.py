@@ -209,6 +209,7 @@ def test_a_folder_that_cannot_be_read_is_not_an_empty_one(
 
 @pytest.mark.parametrize("line", ["fk 0 0 0", "fk 0 0 0 --json", "fk 9 9 9 --json", "help all"])
 @pytest.mark.parametrize("unbuffered", thinned(["", "1"]))
+@pytest.mark.many
 def test_output_to_a_full_disk_is_an_error_in_one_line(line: str, unbuffered: str) -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(
@@ -632,6 +633,7 @@ def test_watch_into_a_pipe_is_a_line_a_second(monkeypatch: pytest.MonkeyPatch) -
 
 @given(line=st.sampled_from(["ik 0 0 0", "workspace", "sessions {}"]), columns=st.integers(10, 200))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@pytest.mark.long
 def test_a_listing_in_a_pipe_is_neither_wrapped_nor_cut(
     line: str, columns: int, named_session: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -708,6 +710,7 @@ def test_an_endless_output_ends_with_its_reader(name: str) -> None:
 
 
 @pytest.mark.parametrize("line", ["help all", "goto --help", "--version", "ik 0 0 0", "ik 0 0 0 --json"])
+@pytest.mark.many
 def test_help_and_results_into_a_closed_pipe_are_no_failure(line: str) -> None:
     reader, writer = os.pipe()
     os.close(reader)
@@ -814,6 +817,7 @@ SPEAKING = [
 
 @pytest.mark.parametrize("words", SPEAKING)
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "koi8-r", "shift_jis", "utf-8"])
+@pytest.mark.many
 def test_an_output_that_lacks_characters_ends_no_command(
     words: str, encoding: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -152,6 +152,7 @@ def test_somebody_may_answer_in_microns(microns: int, written: tuple[str, int]) 
 
 
 @pytest.mark.parametrize("name", thinned(["uvw", "uvw-ppr"]))
+@pytest.mark.long
 def test_a_stage_of_the_other_kind_is_found_by_the_guide(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -248,5 +248,6 @@ def test_not_one_false_done_and_none_missing() -> None:
 
 
 @pytest.mark.generated(3158591621)
+@pytest.mark.long
 def test_nor_in_any_other_session(seed: int) -> None:
     played(seed)

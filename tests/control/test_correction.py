@@ -173,6 +173,7 @@ def test_without_a_correction_they_are_there() -> None:
     assert max(errors(with_backlash(QUICK), 15)) >= OFF
 
 
+@pytest.mark.long
 def test_the_pose_that_is_told_is_the_real_one(corrected: Config) -> None:
     """In motion too, where no slider has turned back for a while."""
     judged = Judged(corrected)

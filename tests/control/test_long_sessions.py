@@ -127,6 +127,7 @@ class Progress:
 @pytest.mark.timeout(3600)
 @pytest.mark.generated(1, 2)
 @pytest.mark.parametrize("robot", thinned(robots(), every=3))
+@pytest.mark.long
 def test_a_long_session_keeps_every_limit_and_ends_every_goal_once(
     robot: str, seed: int, request: pytest.FixtureRequest
 ) -> None:

@@ -182,6 +182,7 @@ def test_a_target_out_of_a_sliders_travel_is_waited_for_too(rig: ControlRig) -> 
 
 @pytest.mark.parametrize("timeout", [0.03, 0.05, 0.1])
 @pytest.mark.parametrize("speed", [0.05, 0.1, 0.2])
+@pytest.mark.many
 def test_before_the_border_every_report_of_a_target_is_accepted(rig: ControlRig, speed: float, timeout: float) -> None:
     """The robot may have to brake at once, for longer than the time-out of the track."""
     rig.enable()

@@ -348,6 +348,7 @@ def rig() -> Iterator[OdriveRig]:
     [tried(mode, case) for case in STOP for mode in case.modes if mode in NOT_HOMING],
     ids=lambda value: value.line if isinstance(value, Case) else value,
 )
+@pytest.mark.many
 def test_a_fault_stops_all_three_drives(rig: OdriveRig, case: Case, mode: str) -> None:
     begun = begin(rig, mode, case.line)
     assert_stops_until_reset(rig, case, begun)
@@ -380,6 +381,7 @@ GO_ON = [
 
 @pytest.mark.parametrize("mode", [*map(tried, NOT_HOMING)])
 @pytest.mark.parametrize("line", GO_ON)
+@pytest.mark.many
 def test_what_does_not_stop_the_robot(rig: OdriveRig, line: str, mode: str) -> None:
     begun = begin(rig, mode, line)
     assert_goes_on(rig, begun, 4 * BEAT)
@@ -416,6 +418,7 @@ def test_a_drive_that_keeps_its_power_stays_at_the_end_of_the_ramp_and_is_named(
 
 @pytest.mark.parametrize("mode", ["holding"])
 @pytest.mark.parametrize(("state", "lost"), [*((state, 0) for state in (*cansimple.PROCEDURES, 5)), (9, 1), (11, 3)])
+@pytest.mark.many
 def test_a_procedure_that_a_drive_begins_by_itself_stops_the_robot_and_is_ended(
     rig: OdriveRig, state: int, lost: int, mode: str
 ) -> None:

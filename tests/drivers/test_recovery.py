@@ -147,6 +147,7 @@ def test_no_drive_is_configured_while_another_still_brakes_because_of_its_fault(
 
 
 @pytest.mark.parametrize("after", [0, 60, 150])
+@pytest.mark.many
 def test_an_error_that_begins_during_the_set_up_of_a_returning_drive_is_reported_until_it_ends(
     rig: RecoveryRig, after: int
 ) -> None:
@@ -196,6 +197,7 @@ def test_reset_is_refused_with_drive_and_progress(rig: RecoveryRig) -> None:
 
 @either
 @pytest.mark.parametrize("away", [(1,), (0, 1, 2)], ids=["one", "all"])
+@pytest.mark.long
 def test_drives_return_to_a_slow_machine(away: tuple[int, ...], rig: RecoveryRig) -> None:
     """Every cycle is late, so that many frames of a drive arrive between two steps of its set-up."""
     holding(rig)
@@ -503,6 +505,7 @@ class AbsentRig(RecoveryRig):
 
 @either
 @pytest.mark.parametrize(("absent", "queue"), [((0, 1, 2), 10), ((0, 1, 2), 0), ((1,), 10), ((0, 2), 10)])
+@pytest.mark.many
 def test_a_service_that_starts_without_drives_configures_them_when_they_appear(
     absent: tuple[int, ...], queue: int, config: Config
 ) -> None:

@@ -97,6 +97,7 @@ def test_noisy_data_gives_poses_better_than_it_has(seed: int) -> None:
     assert 0.8 < found.misfit < 1.2
 
 
+@pytest.mark.long
 def test_standard_errors_are_those_of_many_trials() -> None:
     random = np.random.default_rng(1)
     true = DOUBT * 0.2 * random.standard_normal((3, 5))

@@ -76,6 +76,7 @@ def wave(poses: Array) -> Array:
     )
 
 
+@pytest.mark.long
 def test_what_is_left_at_other_poses_is_foretold_also_if_each_pose_is_measured_repeatedly() -> None:
     said, true = [], []
     for seed in range(3):

@@ -51,6 +51,7 @@ def test_the_figures_are_the_papers() -> None:
 
 
 @pytest.mark.parametrize("name", [*PANELS, "paper"])
+@pytest.mark.many
 def test_every_picture_shows_all_three_sliders(pictures: dict[str, Path], name: str) -> None:
     """Also where their curves coincide; the legends alone would not fill so many pixels."""
     image = imread(pictures[name])
@@ -99,6 +100,7 @@ def test_a_figure_says_how_far_the_service_is_off() -> None:
     ]
 
 
+@pytest.mark.long
 def test_pictures_with_the_service_differ(tmp_path: Path, pictures: dict[str, Path]) -> None:
     with_service = drawn(tmp_path, {name: done.commanded for name, done in driven().items()})
     assert with_service.keys() == pictures.keys()

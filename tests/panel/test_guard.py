@@ -226,6 +226,7 @@ def test_no_program_in_the_folder_of_recordings_is_run(tmp_path: Path) -> None:
     assert session.session in str(recordings.report(session.session))
 
 
+@pytest.mark.long
 def test_recordings_of_a_service_on_another_machine_are_not_looked_for_here(tmp_path: Path) -> None:
     """The same folder here may contain recordings of another robot with the same name."""
     recorder = Recorder(load(SIM), tmp_path, live=False, sidecars=True)

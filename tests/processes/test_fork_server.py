@@ -175,6 +175,7 @@ def test_how_a_child_ends_is_told_and_another_takes_its_place(does: str, how: st
 @pytest.mark.parametrize("call", ["fork", "pidfd_open"])
 @pytest.mark.parametrize("name", ["gateway", "loop"])
 @pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.many
 def test_a_child_that_cannot_be_forked_is_told_with_the_reason_and_another_can(
     call: str, name: str, kept: bool, parent: Parent
 ) -> None:

@@ -128,7 +128,6 @@ class Panel:
             self._serve,
             sock=listening,
             process_request=self._answer,
-            create_connection=_Connection,
             compression=None,  # latency matters more than size
             server_header=None,
             max_size=MAX_MESSAGE,
