@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
+import secrets
 import shutil
 import stat
 import tempfile
@@ -17,6 +19,8 @@ from trirail_drivers.errors import FileError
 LARGEST_TEXT = 16_000_000
 """Maximum size of a text file that is read [bytes], enough for some hundred thousand points of a trajectory."""
 
+_NO_LINKS = (errno.EPERM, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of a file system that has no links."""
 _KINDS = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFDIR: "a folder",
@@ -70,37 +74,80 @@ def replace(path: Path, content: bytes, mode: int = 0o644) -> None:
     """
     descriptor, beside = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # 0600
     try:
-        with os.fdopen(descriptor, "wb") as written:
-            written.write(content)
-            written.flush()
-            os.fchmod(descriptor, mode)
-            os.fsync(descriptor)
+        _write_synced(descriptor, content, mode)
         os.replace(beside, path)
     except BaseException:
         Path(beside).unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
-def create(path: Path, content: bytes) -> None:
-    """Create a file like `replace`, with a mode that follows the umask. After a power cut, the file may be empty.
+def create(path: Path, content: bytes, mode: int = 0o666) -> None:
+    """Create a file so that a crash or a power cut leaves either no file or the complete file.
 
-    Raises FileExistsError if the file already exists, and OSError.
+    The umask is applied to `mode`. Raises FileExistsError if the file already exists, and OSError.
     """
-    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    if os.path.lexists(path):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    beside = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    descriptor = os.open(beside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode)
     try:
-        replace(path, content, path.stat().st_mode & 0o777)
+        _write_synced(descriptor, content)
+        _link(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def _write_synced(descriptor: int, content: bytes, mode: int | None = None) -> None:
+    """Write a file and sync it to the disk; close the descriptor in any case."""
+    with os.fdopen(descriptor, "wb") as written:
+        written.write(content)
+        written.flush()
+        if mode is not None:
+            os.fchmod(descriptor, mode)
+        os.fsync(descriptor)
+
+
+def _link(beside: Path, path: Path) -> None:
+    """Give a file the name `path`; unlike a rename, a link does not replace another file."""
+    try:
+        os.link(beside, path)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+    else:
+        return
+    # FAT, for example on a USB stick, has no links. There, a power cut between these two steps leaves an empty file.
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+    try:
+        os.replace(beside, path)
     except BaseException:
         path.unlink(missing_ok=True)
         raise
 
 
-def make_folder(folder: Path) -> None:
-    """Create a folder and its missing parents, and sync them to the disk. Raises OSError."""
+def make_folder(folder: Path, mode: int = 0o777) -> None:
+    """Create a folder and its missing parents, and sync them to the disk. Raises OSError.
+
+    The umask is applied to `mode`, which is that of the folder itself.
+    """
     if not folder.is_dir():
         make_folder(folder.parent)
-        folder.mkdir(exist_ok=True)
-        _sync_folder(folder.parent)
+        folder.mkdir(mode, exist_ok=True)
+        sync_folder(folder.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Sync the file names in a folder to the disk, since fsync of a file covers its content but not its name.
+
+    Raises OSError.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 PREFIX = "trirail-run-"
@@ -160,15 +207,6 @@ def _lock(folder: Path | str) -> int:
 def check(path: Path) -> None:
     """Raise FileError if a path is not a regular file, and OSError if it does not exist."""
     _check(path, os.stat(path))
-
-
-def _sync_folder(folder: Path) -> None:
-    """Sync the file names in a folder to the disk, since fsync of a file covers its content but not its name."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _check(path: Path, status: os.stat_result) -> None:

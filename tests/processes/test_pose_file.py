@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
 import shutil
@@ -17,8 +18,11 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from trirail.cli.key_folder import KeyFolder
+from trirail.client.calibration_file import keep_old
 from trirail.errors import ServiceError
 from trirail.processes.pose_file import NAME, PoseFile, TaughtPose, state_directory
+from trirail_drivers import files
 
 PICK, PLACE = TaughtPose(0.01, -0.02, 0.3, "0123abcd"), TaughtPose(-0.05, 0.0, -0.1)
 
@@ -40,7 +44,7 @@ class Disk:
         self._cut_after = cut_after
         self._kept: dict[int, bytes] = {path.stat().st_ino: path.read_bytes() for path in folder.iterdir()}
         self._names: list[dict[str, int]] = [self._now()]
-        fsync, replace = os.fsync, os.replace
+        fsync, replace, link = os.fsync, os.replace, os.link
 
         def on_fsync(descriptor: int) -> None:
             self._step()
@@ -56,7 +60,13 @@ class Disk:
             replace(source, target)
             self._names.append(self._now())
 
+        def on_link(source: Path, target: Path) -> None:
+            self._step()
+            link(source, target)
+            self._names.append(self._now())
+
         monkeypatch.setattr(os, "fsync", on_fsync)
+        monkeypatch.setattr(os, "link", on_link)
         monkeypatch.setattr(os, "replace", on_replace)
 
     def _now(self) -> dict[str, int]:
@@ -64,6 +74,7 @@ class Disk:
 
     def _step(self) -> None:
         if self.steps == self._cut_after:
+            self._names.append(self._now())  # what a handler of the exception removes, a power cut leaves
             raise PowerCut
         self.steps += 1
 
@@ -107,6 +118,76 @@ def test_a_power_cut_at_any_step_leaves_the_old_or_the_new_file(
     assert all(each in (old, new) for each in found)
     if cut_after == whole:  # it was said to be kept
         assert all(each == new for each in found)
+
+
+@pytest.mark.parametrize("cut_after", range(4))
+def test_a_power_cut_at_any_step_leaves_a_whole_new_file_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut_after: int
+) -> None:
+    whole = 3
+    with monkeypatch.context() as patched:
+        disk = Disk(tmp_path, patched, cut_after)
+        if cut_after < whole:
+            with pytest.raises(PowerCut):
+                files.create(tmp_path / "drive-A.dcf", b"whole")
+        else:
+            files.create(tmp_path / "drive-A.dcf", b"whole")
+        found = {each.get("drive-A.dcf") for each in disk.possible()}
+        assert disk.steps == min(cut_after, whole)
+    assert found <= {None, b"whole"}
+    if cut_after == whole:
+        assert found == {b"whole"}
+
+
+def test_a_copy_of_an_old_calibration_is_whole_before_the_new_one_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "camera.json"
+    path.write_bytes(b"targets")
+    path.chmod(0o640)
+    with monkeypatch.context() as patched:
+        disk = Disk(tmp_path, patched, 9)
+        old = keep_old(path)
+        assert old is not None
+        assert {each[old.name] for each in disk.possible()} == {b"targets"}
+    assert old.stat().st_mode & 0o777 == 0o640
+
+
+def test_a_folder_of_certificates_has_its_name_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[list[str]] = []
+    sync = files.sync_folder
+
+    def on_sync(folder: Path) -> None:
+        sync(folder)
+        synced.append(sorted(path.name for path in folder.iterdir()))
+
+    monkeypatch.setattr(files, "sync_folder", on_sync)
+    KeyFolder(tmp_path / "keys").create("demo", ["127.0.0.1"], 1.0)
+    assert synced[-1] == ["keys"]
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_disk_without_links_gets_whole_files_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    """FAT has none. A file that is there already is never replaced."""
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    path = tmp_path / "drive-A.dcf"
+    if fails:
+        monkeypatch.setattr(os, "replace", refuse)
+        with pytest.raises(PermissionError):
+            files.create(path, b"whole")
+        assert list(tmp_path.iterdir()) == []
+        return
+    files.create(path, b"whole")
+    with pytest.raises(FileExistsError):
+        files.create(path, b"other")
+    assert path.read_bytes() == b"whole"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_model_of_a_disk_finds_what_is_not_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

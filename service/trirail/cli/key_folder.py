@@ -160,11 +160,12 @@ def _write_pair(folder: Path, pair: Pair) -> None:
 def _atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a private folder to write to, and rename it to `folder` if the context ends without an error."""
     with _as_service_error():
-        folder.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+        files.make_folder(folder.parent, 0o755)
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
         try:
             yield made
             made.rename(folder)
+            files.sync_folder(folder.parent)
         except BaseException:
             rmtree(made, ignore_errors=True)
             raise

@@ -114,8 +114,7 @@ def read_token(file: Path) -> str:
     Raises ConfigError if others can read the file or if it does not contain a token.
     """
     try:
-        with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as made:
-            made.write(f"{secrets.token_urlsafe(TOKEN_BYTES)}\n")
+        files.create(file, f"{secrets.token_urlsafe(TOKEN_BYTES)}\n".encode(), 0o600)
     except FileExistsError:
         pass
     except OSError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import stat
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -77,9 +77,10 @@ def keep_old(path: Path) -> Path | None:
         return None
     old = path.with_name(f"{path.name}.old")
     try:
-        return Path(shutil.copy2(path, old))
+        files.replace(old, path.read_bytes(), stat.S_IMODE(path.stat().st_mode))
     except OSError as error:
         raise FileError(f"cannot copy {path} to {old}: {error.strerror}") from error
+    return old
 
 
 def _problem(calibration: CameraCalibration) -> str | None:
