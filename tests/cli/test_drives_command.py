@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,11 @@ from trirail.cli.drives_command import UNTESTED_NOTE
 from trirail.config import SIM
 from trirail_drivers import files
 from trirail_drivers.cia402 import parameter_file
+from trirail_drivers.cia402.backup import RestoreResult, UnrestoredParameter
+from trirail_drivers.cia402.parameter_file import ParameterDifference
+from trirail_drivers.cia402.parameters import Parameter, named
 from trirail_drivers.errors import DriveError, FileError
+from trirail_drivers.protocols import CIA402
 from trirail_drivers.simulated import SimulatedDrive
 
 
@@ -98,6 +103,28 @@ def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pyte
         run("drives", "restore", str(b), "--drive", "B")
 
 
+def test_a_restore_lists_every_parameter_that_it_leaves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine, theirs = (Parameter(5, bytes([value]), "Node-ID") for value in (1, 2))
+    of_setup = [(0x1A00, sub) for sub in range(1, 13)]
+    left = tuple(
+        UnrestoredParameter(
+            ParameterDifference(key, "Node-ID", mine, theirs), f"why {key[0]:04X}", True, key in of_setup
+        )
+        for key in (*of_setup, (0x2000, 0))
+    )
+    done = RestoreResult((), left, False, "")
+    run("drives", "save", str(tmp_path), "--drive", "A")
+    protocol = dataclasses.replace(CIA402, restore=lambda *_, **__: done)
+    monkeypatch.setattr("trirail_drivers.protocols.PROTOCOLS", {"cia402": protocol})
+    capsys.readouterr()
+    assert run("drives", "restore", str(tmp_path / "drive-A.dcf")) == 0
+    words = capsys.readouterr().out
+    assert all(named(each.different.key) in words for each in left)
+    assert re.search(r"2000:00 +Node-ID +1 +2 +why 2000", words)
+
+
 def test_the_drives_that_answer_are_saved_and_the_others_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -128,14 +155,14 @@ def test_a_file_is_never_written_over(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_written_costs_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    replace = files.replace
+    create = files.create
 
-    def full(path: Path, content: bytes, mode: int) -> None:
+    def full(path: Path, content: bytes) -> None:
         if path.name == "drive-B.dcf":
             raise OSError(errno.ENOSPC, "No space left on device")
-        replace(path, content, mode)
+        create(path, content)
 
-    monkeypatch.setattr(files, "replace", full)
+    monkeypatch.setattr(files, "create", full)
     assert run("drives", "save", str(tmp_path), "--json") == 1
     told = json.loads(capsys.readouterr().out)
     assert (told["ok"], sorted(told["drives"])) == (False, ["A", "C"])

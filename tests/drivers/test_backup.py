@@ -32,7 +32,7 @@ from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.objects import USES, Key
 from trirail_drivers.cia402.parameter_file import SavedParameters
 from trirail_drivers.cia402.parameters import named, parameter, variables
-from trirail_drivers.config import Drives
+from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.protocols import CIA402
 from trirail_drivers.simulated import SimulatedDrive
@@ -48,12 +48,13 @@ VOLATILE = {0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1F50, 0x1F51, 0x6040, 0x60
 """What these dictionaries let be written that no drive keeps: targets, offsets, controlwords, commands."""
 HOMING = {0x607C, 0x6098, 0x6099, 0x609A}
 """Objects that set-up writes only where a drive has homing, which these have not."""
+OUTPUT_MASK = 0x60FE, 2
 OWNED = {int(name[:4], 16) for name in USES} - HOMING | {0x60B0, 0x60B2}
 
 
 def set_ups(key: Key) -> bool:
-    """Whether set-up gives an object."""
-    return 0x1400 <= key[0] < 0x1C00 or key[0] in OWNED
+    """Whether set-up gives an object; these robots use no outputs, whose mask is 60FEh:02."""
+    return key != OUTPUT_MASK and (0x1400 <= key[0] < 0x1C00 or key[0] in OWNED)
 
 
 class Kept:
@@ -68,7 +69,7 @@ class Kept:
         assert isinstance(found, SavedParameters), found
         return found
 
-    def restore(self, saved: SavedParameters, **options: bool) -> RestoreResult:
+    def restore(self, saved: SavedParameters, **options: Any) -> RestoreResult:
         return backup.restore(self.bus, self.drives, self.clock, "A", saved, **options)
 
 
@@ -730,6 +731,38 @@ def test_node_id_and_bitrate_are_left_as_they_are(tmp_path: Path) -> None:
     done = rig.restore(saved)
     assert [(each.different.key, each.intended) for each in done.left] == [(NODE_ID, True)]
     assert (done.written, done.ok) == ((), True)
+    rig.wires.shutdown()
+
+
+def test_parameters_whose_names_only_resemble_an_address_are_restored(tmp_path: Path) -> None:
+    """Those of the bus are left, each with its reason."""
+    names = {1: "Number of pole pairs", 2: "Node-ID", 3: "Device ID", 4: "RS232 bit rate"}
+    more = tuple((0x3000, sub, 5, "rw", 7, False) for sub in names)
+    rig = Foreign(tmp_path, habits=Habits(more=more))
+    eds_path = Path(str(rig.drives.A.eds))
+    text = eds_path.read_text().replace("=Object 3000\n", "=Motor device\n")
+    for sub, name in names.items():
+        text = text.replace(f"=Object 3000sub{sub}\n", f"={name}\n")
+    eds_path.write_text(text)
+    saved = rig.save()
+    for sub in names:
+        rig.a.put(0x3000, 5, sub)
+    done = rig.restore(saved)
+    assert set(done.written) == {(0x3000, 1), (0x3000, 4)}
+    assert [each.different.key for each in done.left] == [(0x3000, 2), (0x3000, 3)]
+    assert all(each.intended and not each.by_setup and "node id" in each.why for each in done.left)
+    rig.wires.shutdown()
+
+
+@pytest.mark.parametrize("outputs", [0, 1 << 16])
+def test_the_mask_of_outputs_is_restored_unless_the_robot_has_outputs(outputs: int, tmp_path: Path) -> None:
+    rig = Foreign(tmp_path, "elmo_gold")
+    saved = rig.save()
+    held = saved.parameters[OUTPUT_MASK].value
+    rig.a.put(0x60FE, 5, 2)
+    done = rig.restore(saved, io=(DigitalIo(outputs), *NO_IO[1:]))
+    assert rig.a.value(0x60FE, 2) == (5 if outputs else held)
+    assert [(each.different.key, each.by_setup) for each in done.left] == ([(OUTPUT_MASK, True)] if outputs else [])
     rig.wires.shutdown()
 
 

@@ -210,6 +210,8 @@ def test_what_the_set_up_writes_is_refused_and_not_restored(
     [
         *("CANaddress", "CAN node number", "Node address", "CAN address", "Station address", "Device ID", "CAN_ID"),
         *("Bit timing", "Node-ID", "CANopen NodeID", "Baudrate", "CAN bit rate", "Node Number", "Bus address"),
+        *("Node.ID", "CANopen device.Address", "Communication.Node-ID", "Node-ID.Value", "RS485/CAN baud rate"),
+        *("Motor controller.Node ID", "CAN settings.Encoder and bus bit rate"),
     ],
 )
 def test_an_object_with_the_name_of_an_address_is_left(name: str) -> None:
@@ -217,7 +219,17 @@ def test_an_object_with_the_name_of_an_address_is_left(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["Device identification", "Encoder ID", "Motor number", "Scan address", "Bus voltage", "Cancel number"]
+    "name",
+    [
+        *("Device identification", "Encoder ID", "Motor number", "Scan address", "Bus voltage", "Cancel number"),
+        *("Motor device.Number of pole pairs", "Node.Number of turns", "Slave number of the master", "Motor device.ID"),
+        *("RS232 bit rate", "Encoder.Baud rate", "USB device ID", "Modbus node address", "SSI bit rate"),
+    ],
 )
 def test_an_object_with_another_name_is_none(name: str) -> None:
     assert address((0x3041, 0), name, 1) == ""
+
+
+@pytest.mark.parametrize("index", [0x1028, 0x1F81, 0x6404, 0x6503])
+def test_no_object_of_the_standards_is_an_address(index: int) -> None:
+    assert address((index, 1), "Node-ID of a consumer", 1) == address((index, 1), "Bus address", 1) == ""

@@ -12,6 +12,7 @@ from canopen.objectdictionary import ODArray
 
 from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames, setup
+from trirail_drivers.cia402.digital_io import MASK
 from trirail_drivers.cia402.makers_objects import UNITS, address, owned
 from trirail_drivers.cia402.objects import Key
 from trirail_drivers.cia402.one_drive import HAS_POWER, wait_for_drive
@@ -27,7 +28,7 @@ from trirail_drivers.cia402.parameter_file import (
 )
 from trirail_drivers.cia402.parameters import Parameter, is_parameter, named, parameter, variables
 from trirail_drivers.cia402.sdo import Remote, SdoRefused, TransferError, reason
-from trirail_drivers.config import Drive, Drives
+from trirail_drivers.config import NO_IO, DigitalIo, Drive, Drives
 from trirail_drivers.driver.conversations import read_until, run_concurrently
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock, PowerState
@@ -58,6 +59,8 @@ class UnrestoredParameter(NamedTuple):
     why: str
     intended: bool
     """Whether the parameter was skipped on purpose, because the set-up writes it or it is the node id or bit rate."""
+    by_setup: bool = False
+    """Whether it was skipped because the set-up writes it at each start of the service."""
 
 
 class RestoreResult(NamedTuple):
@@ -109,15 +112,17 @@ def restore(
     *,
     replace: bool = False,
     store: bool = False,
+    io: Sequence[DigitalIo] = NO_IO,
 ) -> RestoreResult:
     """Write the parameters that differ from a file, read each back, and report the remaining differences.
 
-    Objects that the set-up writes, the node id and the bit rate are skipped. The drive must be the same product as in
-    the file; with `replace`, its revision, serial number or node id may differ. With `store`, the drive stores the
-    parameters (1010h) once all are restored. Raises DriveError if the drive has power, or if another master is on the
-    bus.
+    Objects that the set-up writes with the drives' digital outputs `io`, the node id and the bit rate are skipped. The
+    drive must be the same product as in the file; with `replace`, its revision, serial number or node id may differ.
+    With `store`, the drive stores the parameters (1010h) once all are restored. Raises DriveError if the drive has
+    power, or if another master is on the bus.
     """
     begun = _Progress()
+    has_outputs = bool(io[NAMES.index(name)].outputs)
     try:
         (result,) = _run_conversations(
             bus,
@@ -125,7 +130,9 @@ def restore(
             clock,
             [name],
             begun,
-            lambda remote, drive: _restore(remote, drive, saved, begun, replace=replace, store=store),
+            lambda remote, drive: _restore(
+                remote, drive, saved, begun, has_outputs=has_outputs, replace=replace, store=store
+            ),
         ).values()
         if isinstance(result, DriveError):
             raise result
@@ -227,15 +234,26 @@ async def _origin(remote: Remote, drive: Drive) -> Origin:
 
 
 async def _restore(
-    remote: Remote, drive: Drive, saved: SavedParameters, progress: _Progress, *, replace: bool, store: bool
+    remote: Remote,
+    drive: Drive,
+    saved: SavedParameters,
+    progress: _Progress,
+    *,
+    has_outputs: bool,
+    replace: bool,
+    store: bool,
 ) -> RestoreResult:
     await wait_for_drive(remote, drive.node, to_pre_operational=False)
     await _check_without_power(remote)
     drive_origin = await _origin(remote, drive)
     _check(remote.name, saved.origin, drive_origin, replace=replace)
     send_in_setup(remote.client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
+    written_by_setup = {
+        key: "" if key[0] in UNITS or (key == MASK and not has_outputs) else owned(key, drive)
+        for key in saved.parameters
+    }
     kept = {
-        key: _skip_reason(remote, drive, key, each, saved.origin, drive_origin)
+        key: _skip_reason(remote, drive, key, each, saved.origin, drive_origin) or written_by_setup[key]
         for key, each in saved.parameters.items()
     }
     units = {key: each for key, each in saved.parameters.items() if key[0] in UNITS}
@@ -253,7 +271,9 @@ async def _restore(
             break
     now = await _read_held(remote, saved.parameters, progress)
     left = tuple(
-        UnrestoredParameter(each, kept[each.key] or refused.get(each.key, ""), bool(kept[each.key]))
+        UnrestoredParameter(
+            each, kept[each.key] or refused.get(each.key, ""), bool(kept[each.key]), bool(written_by_setup[each.key])
+        )
         for each in compare(saved, SavedParameters(saved.origin, now, {}))
     )
     stored, not_stored = False, ""
@@ -332,16 +352,14 @@ async def _read_held(remote: Remote, parameters: Mapping[Key, Parameter], progre
 
 
 def _skip_reason(remote: Remote, drive: Drive, key: Key, saved: Parameter, of_file: Origin, of_drive: Origin) -> str:
-    """Return the reason why a parameter is skipped, or ""."""
+    """Return the reason why a parameter is skipped although no set-up writes it, or ""."""
     variable = remote.client.od.get_variable(*key) if drive.eds else None
     if variable is not None and not is_parameter(variable):
         return "is no parameter of the drive"
     if key[0] in _SDO_CHANNELS and of_file.node != of_drive.node:
         return "follows the node id"
-    if key[0] in UNITS:
-        return ""
     names = (saved.name, remote.name_of(key))
-    return owned(key, drive) or next(filter(None, (address(key, name, of_drive.vendor) for name in names)), "")
+    return next(filter(None, (address(key, name, of_drive.vendor) for name in names)), "")
 
 
 def _check(name: str, of_file: Origin, of_drive: Origin, *, replace: bool) -> None:

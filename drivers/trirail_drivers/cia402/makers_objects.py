@@ -26,12 +26,22 @@ _ADDRESSES: Final = {
     0x0000_026C: (0x2005, 0x2009),  # Nanotec, manuals, object dictionary: CANopen Baudrate, CANopen NodeID
 }
 """Objects that contain the node id and the bit rate, by vendor id (1018h:01)."""
+_MAKERS: Final = range(0x2000, 0x6000)
+"""Objects of manufacturers. No object of CiA 301 and CiA 402-2 contains the node id or the bit rate; 100Bh did once."""
+_BARE_ADDRESS: Final = re.compile(r"id|addr(ess)?|n(umbe)?r", re.IGNORECASE)
+"""Names of sub-objects that mean the node id only together with the name of their object, such as Node and ID."""
 _ADDRESS_NAMES: Final = re.compile(
-    r"(node|station|device|slave|bus|(?<![a-z])can(open)?).?(id\b|id[^a-z]|addr|n(umbe)?r\b)|node.?id|"
-    r"can(open)?.?node|bit.?(rate|timing)|baud",
+    r"((node|station|slave|bus|(^|can(open)?\W*)device|(?<![a-z])can(open)?).?(id\b|id[^a-z]|addr|n(umbe)?r\b)|"
+    r"node.?id|can(open)?.?node|bit.?(rate|timing)|baud)(?!\W*of\b)",
     re.IGNORECASE,
 )
-"""Usual names of objects that contain the node id or the bit rate."""
+"""Usual names of objects that contain the node id or the bit rate; names such as "slave number of turns" differ."""
+_OTHER_BUS: Final = re.compile(
+    r"rs.?(232|422|485)|usb|uart|serial|\bs[cps]i\b|i2c|biss|endat|hiperface|encoder|sensor|resolver|modbus|ethernet|"
+    r"ethercat|profi(bus|net)|bluetooth",
+    re.IGNORECASE,
+)
+"""Words for other connections of a drive, which have addresses and bit rates too."""
 
 
 def check(name: str, drive: Drive, number: int) -> None:
@@ -58,8 +68,19 @@ def owned(key: Key, drive: Drive) -> str:
 
 
 def address(key: Key, name: str, vendor: int | None) -> str:
-    """Return an error message if an object contains the node id or bit rate, judging by its vendor or name, or ""."""
-    return _ADDRESS if key[0] in _ADDRESSES.get(vendor or 0, ()) or _ADDRESS_NAMES.search(name) else ""
+    """Return an error message if an object contains the node id or the bit rate on the CAN bus, or "".
+
+    Such an object is recognised by its index if the manufacturer's is known, otherwise by the name of the object or of
+    the sub-object: "Motor device.Number of pole pairs" contains "device number" in neither name.
+    """
+    if key[0] in _ADDRESSES.get(vendor or 0, ()):
+        return _ADDRESS
+    if key[0] not in _MAKERS or (_OTHER_BUS.search(name) and not re.search(r"(?<![a-z])can", name, re.IGNORECASE)):
+        return ""
+    names = name.split(".")
+    if _BARE_ADDRESS.fullmatch(names[-1].strip()):
+        names.append(" ".join(names[-2:]))
+    return _ADDRESS if any(_ADDRESS_NAMES.search(each.strip()) for each in names) else ""
 
 
 async def write_makers_objects(drive: Differences, writes: tuple[ObjectWrite, ...]) -> None:

@@ -58,7 +58,8 @@ class Protocol:
     restore: Callable[..., RestoreResult] | None
     """Function that restores the parameters of a drive; None if the drives have no object dictionary.
 
-    Arguments: the bus, section [drives], the clock, the name of the drive and its saved parameters.
+    Arguments: the bus, section [drives], the clock, the name of the drive, its saved parameters, and the digital
+    outputs and inputs `io` of each drive.
     """
     protections: Mapping[str, str]
     """Names that `accept_without` may contain, each with its description for people."""

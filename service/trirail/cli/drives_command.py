@@ -239,7 +239,7 @@ def restore(
     """Restore a drive's parameters from a file, and read them back; exit 1 if any still differs.
 
     The drive must be without power, and no service or other master may be on the bus. Parameters of the set-up, the
-    node id and the bitrate do not change. A file for another product is refused.
+    node id and the bitrate do not change; those that differ are listed. A file for another product is refused.
 
     Parameters
     ----------
@@ -260,7 +260,9 @@ def restore(
     if protocol.restore is None:
         raise _no_dictionary_error(protocol)
     with open_bus(settings.can, settings.drives) as bus:
-        done = protocol.restore(bus, settings.drives, time.monotonic, name, saved, replace=replace, store=store)
+        done = protocol.restore(
+            bus, settings.drives, time.monotonic, name, saved, replace=replace, store=store, io=settings.drive_io
+        )
     if json:
         left = [_as_json(each.different) | {"why": each.why, "meant": each.intended} for each in done.left]
         written = [_named(key) for key in done.written]
@@ -320,14 +322,14 @@ def _no_dictionary_error(protocol: Protocol) -> DriveError:
     )
 
 
-def _print_unrestored(file: str, name: str, left: Iterable[UnrestoredParameter]) -> None:
-    intended = [_named(each.different.key) for each in left if each.intended]
-    if intended:
-        kinds = "the set-up's, node id, bitrate or no parameter"
-        terminal.print_line(f"  {len(intended)} left as they are, {kinds}: {_abbreviate(intended)}")
-    if others := [(each.different, each.why) for each in left if not each.intended]:
-        terminal.print_line(f"  {len(others)} differ still:")
-        _print_differences(file, f"drive {name}", others)
+def _print_unrestored(file: str, name: str, left: Sequence[UnrestoredParameter]) -> None:
+    if of_setup := [_named(each.different.key) for each in left if each.by_setup]:
+        terminal.print_line(f"  {len(of_setup)} left as they are, written by the set-up: {', '.join(of_setup)}")
+    skipped = [each for each in left if each.intended and not each.by_setup]
+    for words, rows in (("left as they are", skipped), ("differ still", [each for each in left if not each.intended])):
+        if rows:
+            terminal.print_line(f"  {len(rows)} {words}:")
+            _print_differences(file, f"drive {name}", [(each.different, each.why) for each in rows])
 
 
 def _print_differences(one: str, other: str, rows: Iterable[tuple[ParameterDifference, str]]) -> None:
