@@ -286,7 +286,8 @@ def test_a_file_that_was_cut_off_is_refused(seed: int, tmp_path: Path) -> None:
     with pytest.raises(DriveError, match=r"a.dcf .*: it ends within a value"):
         parameter_file.read(path)
     path.write_text(path.read_text() + "\n")
-    with pytest.raises(DriveError, match=r"a.dcf .*: it lists object \w{4} but does not describe it"):
+    said = r"a.dcf( .*: it lists object \w{4} but does not describe it|: it ends within object \w{4}, with)"
+    with pytest.raises(DriveError, match=said):
         parameter_file.read(path)
 
 
@@ -323,6 +324,23 @@ def test_a_file_that_was_cut_off_between_two_lists_is_refused(end: str, tmp_path
     assert found
     path.write_text(before)
     with pytest.raises(DriveError, match=r"a\.dcf .*: its list \[\w+Objects\] is missing or too short"):
+        parameter_file.read(path)
+
+
+@pytest.mark.parametrize("cut", ["[3000sub1]", "[3000sub2]"])
+def test_a_file_that_ends_within_a_record_is_refused(cut: str, tmp_path: Path) -> None:
+    """The list of objects names the record, which is there."""
+    facts = [*rows("elmo_gold"), *((0x3000, sub, 5, "rw", 7, False) for sub in range(3))]
+    facts = [row for row in facts if not 0x3000 < row[0] < 0x6000]
+    path, source = tmp_path / "a.dcf", tmp_path / "a.eds"
+    source.write_text(eds(facts))
+    with Line(source) as line:
+        parameter_file.write(path, line.save())
+    text = path.read_text()
+    last = text[text.index("[3000]") :]
+    assert not re.findall(r"\n\[(?!3000)", last)
+    path.write_text(text[: text.index(cut)])
+    with pytest.raises(DriveError, match=rf"a\.dcf: it ends within object 3000, with {cut[-2]} of 3 sub-objects"):
         parameter_file.read(path)
 
 

@@ -99,6 +99,69 @@ def test_objects_that_are_sound_are_used_and_others_told_with_section_and_line(
     assert content(objects) == {key: value for key, value in content(sound).items() if key not in lost}
 
 
+def _records(text: str) -> list[tuple[str, int, list[int]]]:
+    """Each record with its index, its end, and the places in it where a cut leaves out whole sub-objects."""
+    found = []
+    for record in re.finditer(r"\[([0-9A-F]{4})\]\n[^[]*SubNumber=\d+\n\n?(?:\[\1sub[^[]*)+", text):
+        subs = [record.start() + each.start() for each in re.finditer(r"\[\w{4}sub", record[0])]
+        found.append((record[1], record.end(), subs))
+    return found
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_a_file_that_ends_within_a_record_is_refused(tmp_path: Path, make: str) -> None:
+    """One that ends after it is read; and so is one whose maker counted wrongly before its end."""
+    text = eds(rows(make))
+    records = _records(text)
+    assert len(records) > 5
+    for index, end, subs in records[::7]:
+        load("A", written(tmp_path, text[:end]), NODE)
+        for cut in subs:
+            path = written(tmp_path, text[:cut])
+            with pytest.raises(
+                DriveError, match=re.escape(f"drive A: {path}: it ends within object {index}, with ")
+            ) as refused:
+                load("A", path, NODE)
+            assert str(refused.value).endswith("is the file complete?")
+    miscounted = text[: records[0][1]].replace("SubNumber=", "SubNumber=1") + text[records[0][1] :]
+    assert content(load("A", written(tmp_path, miscounted), NODE)[0]) == content(
+        load("A", written(tmp_path, text), NODE)[0]
+    )
+
+
+def test_objects_that_are_listed_and_not_described_are_told(tmp_path: Path) -> None:
+    """As in a file that ends between two objects."""
+    whole = eds(rows(MAKES[0]))
+    lists = "[OptionalObjects]\nSupportedObjects=3\n1=0x6065\n2=0x5FFE\n3=0x5fff\n\n"
+    path = written(tmp_path, whole.replace("[1000]\n", f"{lists}[1000]\n"))
+    _, warning = load("A", path, NODE)
+    assert warning == (
+        f"skipped in {path}: 2 objects that it lists but does not describe, such as 5FFE; is the file complete?"
+    )
+
+
+@pytest.mark.parametrize(
+    ("record", "is_whole"),
+    [
+        ("ObjectType=0x9\n", False),
+        ("ObjectType=8\nsubnumber=1\n", False),
+        ("ObjectType=8\nDataType=7\nAccessType=rw\nCompactSubObj=2\n", True),
+        ("ObjectType=9\nSubNumber=x\n[5000sub0]\nParameterName=a\nDataType=7\nAccessType=rw\n", True),
+        ("ObjectType=9\nSubNumber=3\n[5000sub2]\nParameterName=a\nDataType=7\nAccessType=rw\n", True),
+        ("SubNumber=3\n[5000sub0]\nParameterName=a\nDataType=7\nAccessType=rw\n", False),
+    ],
+)
+def test_the_last_object_is_whole_if_it_has_as_many_sub_objects_as_it_says(
+    tmp_path: Path, record: str, is_whole: bool
+) -> None:
+    path = written(tmp_path, f"{eds(rows(MAKES[0]))}\n[5000]\nParameterName=Last\n{record}")
+    if is_whole:
+        assert 0x5000 in load("A", path, NODE)[0]
+    else:
+        with pytest.raises(DriveError, match="it ends within object 5000, with"):
+            load("A", path, NODE)
+
+
 @pytest.mark.parametrize(
     "text", ["", "\n\n", "\ufeff", "\x1a", "[DeviceInfo]\nVendorName=x\n", "[5FFFsub1]\nDataType=7\n"]
 )

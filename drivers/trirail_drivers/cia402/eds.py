@@ -19,10 +19,14 @@ _OBJECT = re.compile(r"([0-9A-F]{4})(sub[0-9A-F]+|Name)?", re.IGNORECASE)
 _OTHER_OBJECT = re.compile(r"[0-9A-F]{4}(Value|Denotation|ObjectLinks)|CANopenManager", re.IGNORECASE)
 """Names of further sections about an object (CiA 306)."""
 _LIKE_OBJECT = re.compile(r"(0x)?[0-9A-F]{3,4}([^A-Z]|sub|$)", re.IGNORECASE)
+_LIST = re.compile(r"(Mandatory|Optional|Manufacturer)Objects", re.IGNORECASE)
+_INDEX = re.compile(r"0x[0-9A-F]{4}", re.IGNORECASE)
 _PADDED_DIGIT = re.compile(r"0+([0-7])")
 """Digit from 0 to 7 with leading zeros, which is the same number in decimal and octal."""
 _VERBATIM = ("parametervalue", "defaultvalue")
 """Keys whose digits may be an octet string, in which zeros are significant."""
+_WITH_SUB_OBJECTS = (8, 9)
+"""Object types of arrays and records (CiA 301)."""
 _AFTER = "\x1a\0"
 """Characters that old editors wrote after the end of a text."""
 
@@ -45,6 +49,14 @@ class Section(NamedTuple):
         """Name of the object's main section, if this section belongs to a subindex or to array names, otherwise ""."""
         match = _OBJECT.fullmatch(self.name)
         return match[1].upper() if match and match[2] else ""
+
+    def number(self, key: str) -> int | None:
+        """Return the number under a key; None if there is none."""
+        text = next((value for name, value in self.values.items() if name.casefold() == key.casefold()), "")
+        try:
+            return int(text, 0)
+        except ValueError:
+            return None
 
     def __str__(self) -> str:
         values = "\n".join(f"{key}={value}" for key, value in self.values.items())
@@ -143,8 +155,50 @@ def read(file: Path, node: int) -> ObjectDictionary:
 
 
 def open_text(file: Path) -> io.StringIO:
-    """Open a manufacturer's file as text that canopen can read; unreadable lines are repaired or omitted."""
-    return _text(file, sort_sections(sections_of(_content(file))[0]))
+    """Open a manufacturer's file as text that canopen can read; unreadable lines are repaired or omitted.
+
+    Raises DriveError if the file cannot be read or was cut off within an object.
+    """
+    return _text(file, sort_sections(_sections(file)[0]))
+
+
+def _sections(file: Path) -> tuple[list[Section], list[str]]:
+    """Return the sections of a file, and notes about the lines that were skipped. Raises DriveError as `open_text`."""
+    sections, notes = sections_of(_content(file))
+    _check_end(file, sections)
+    listed = {
+        int(value, 16)
+        for each in sections
+        if _LIST.fullmatch(each.name)
+        for key, value in each.values.items()
+        if key.isdigit() and _INDEX.fullmatch(value)
+    }
+    if missing := sorted(listed - {each.object for each in sections}):
+        notes.append(
+            f"{len(missing)} objects that it lists but does not describe, such as {missing[0]:04X}; is the file "
+            "complete?"
+        )
+    return sections, notes
+
+
+def _check_end(file: Path, sections: list[Section]) -> None:
+    """Raise DriveError if the last object of a file lacks sub-objects, because canopen would silently omit them.
+
+    Objects before the last are not checked: their sub-objects were not cut off, and some manufacturers count wrongly.
+    """
+    index = next((each.object for each in reversed(sections) if each.object is not None), None)
+    own = [each for each in sections if each.object == index]
+    main = next((each for each in own if not each.parent), None)
+    if main is None or main.number("CompactSubObj"):
+        return
+    described = [int(each.name[7:], 16) for each in own if each.name[4:7] == "sub"]
+    wanted = main.number("SubNumber") or (1 if main.number("ObjectType") in _WITH_SUB_OBJECTS else 0)
+    # Some manufacturers give the highest subindex plus 1, although subindices between are missing.
+    if max(len(described), *(1 + each for each in described), 0) < wanted:
+        raise DriveError(
+            f"{file}: it ends within object {index:04X}, with {len(described)} of {wanted} sub-objects; is the file "
+            "complete?"
+        )
 
 
 def _content(file: Path) -> str:
@@ -165,7 +219,7 @@ def _text(file: Path, sections: list[Section]) -> io.StringIO:
 
 def _read(file: Path, node: int) -> tuple[ObjectDictionary, list[str]]:
     """Return the readable objects of a file, and notes about skipped lines. Raises DriveError."""
-    sections, notes = sections_of(_content(file))
+    sections, notes = _sections(file)
     sections = sort_sections(sections)
     try:
         objects = canopen.import_od(_text(file, sections), node)
