@@ -294,6 +294,24 @@ def test_the_oldest_recordings_go_and_black_boxes_last(tmp_path: Path) -> None:
     assert retention.tidy(tmp_path, 1e6).deleted == [live]
 
 
+@pytest.mark.parametrize("live_mb", [(9,), (50,), (30, 30), (5, 4)])
+def test_files_that_are_being_written_take_the_place_of_at_most_half_of_the_others(
+    tmp_path: Path, live_mb: tuple[int, ...]
+) -> None:
+    boxes = [kept(tmp_path, f"fault-2026010{day}-100000.rrd", 1) for day in (1, 2)]
+    old = [kept(tmp_path, f"demo-2026010{day}-110000.rrd", 2) for day in range(1, 9)]
+    live = [kept(tmp_path, f"other-20260101-09000{which}.rrd", size) for which, size in enumerate(live_mb)]
+    locks = [retention.lock(path) for path in live]
+    assert retention.tidy(tmp_path, 18e6).deleted == old[:5]
+    assert retention.tidy(tmp_path, 18e6).deleted == []
+    assert retention.tidy(tmp_path, 4e6, live[0].stem).deleted == old[5:]
+    assert all(path.exists() for path in (*boxes, *live))
+    for lock in locks:
+        retention.unlock(lock)
+    assert set(retention.tidy(tmp_path, 4e6).deleted) == set(live)
+    assert all(path.exists() for path in boxes)
+
+
 @settings(max_examples=30)
 @given(
     others=st.lists(

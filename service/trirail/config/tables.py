@@ -336,7 +336,9 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     rotate_mb: Annotated[float, Meta(ge=1.0, le=1e6)] = 1000.0
     """Maximum size of one recording file [1e6 bytes]."""
     keep_mb: Annotated[float, Meta(ge=1.0, le=1e9)] = 20_000.0
-    """Maximum total size of the recordings in the folder [1e6 bytes]. The oldest recordings are deleted first."""
+    """Maximum total size of the recordings in the folder [1e6 bytes]. The oldest recordings are deleted first, black
+    boxes last. The files that are being written count for at most half, so that a large one does not take the place of
+    every other."""
 
 
 class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):

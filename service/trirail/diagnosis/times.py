@@ -85,8 +85,8 @@ def _times(config: Config) -> Iterator[Check]:
 def _sizes(config: Config) -> Iterator[Check]:
     """Check that a recording's files are smaller than the maximum for all recordings, but not too small."""
     rotate, keep = config.telemetry.rotate_mb, config.telemetry.keep_mb
-    if rotate > keep:
-        finding = f"telemetry.rotate_mb = {rotate:g} exceeds telemetry.keep_mb = {keep:g}, the total of all recordings"
+    if rotate > keep / 2.0:  # above this, a file that is being written does not count, see telemetry.retention.tidy
+        finding = f"telemetry.rotate_mb = {rotate:g} exceeds half of telemetry.keep_mb = {keep:g}, the total of all"
         yield Check(
             "recordings", "warning", finding, "set rotate_mb to a tenth of keep_mb or less", "telemetry.rotate_mb"
         )

@@ -102,24 +102,35 @@ def tidy(directory: Path, at_most: float, session: str = "") -> Tidied:
     """Delete the oldest recordings until the others need at most `at_most` bytes.
 
     Recordings of the running `session` are deleted after those of other sessions, regardless of their dates. Black
-    boxes are deleted last. A file that is being written is not deleted. A recording that cannot be deleted is reported
-    and does not count, because all others would be deleted in its place if it were large.
+    boxes are deleted last. A file that is being written is not deleted, and all such files count for at most half of
+    `at_most`: a single large one would otherwise take the place of every other recording. A recording that cannot be
+    deleted is reported and does not count, for the same reason.
     """
     try:
         recordings = sorted(_recordings(directory, session), key=lambda kept: kept.order)
     except OSError as error:
         return Tidied([], [error])
-    total = sum(kept.size for kept in recordings)
-    deleted, errors = list[Path](), list[OSError]()
+    if sum(kept.size for kept in recordings) <= at_most:
+        return Tidied([], [])
+    finished, errors = list[_StoredRecording](), list[OSError]()
+    being_written = 0
     for kept in recordings:
+        try:
+            if is_being_written(kept.path):
+                being_written += kept.size
+            else:
+                finished.append(kept)
+        except FileNotFoundError:  # another process has just deleted the recording
+            pass
+        except OSError as error:
+            errors.append(error)
+    total = sum(kept.size for kept in finished) + min(being_written, at_most / 2.0)
+    deleted = list[Path]()
+    for kept in finished:
         if total <= at_most:
             break
         try:
-            if is_being_written(kept.path):
-                continue
             delete(kept.path)
-        except FileNotFoundError:  # another process has just deleted the recording
-            pass
         except OSError as error:
             errors.append(error)
         else:
