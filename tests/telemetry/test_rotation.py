@@ -11,7 +11,7 @@ import sys
 import tempfile
 import warnings
 from collections import namedtuple
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from trirail.errors import ServiceError
 from trirail.processes import loop
 from trirail.processes.recording import GATHER
 from trirail.processes.reports import BATCHES_PER_SECOND
-from trirail.telemetry import blackbox, provenance, retention
+from trirail.telemetry import blackbox, contents, provenance, retention
 from trirail.telemetry.blackbox import AFTER_S, BEFORE_S, BlackBox
 from trirail.telemetry.provenance import SOFTWARE
 from trirail.telemetry.reading import join, read
@@ -401,6 +401,43 @@ def test_logs_of_frames_go_with_their_recordings(tmp_path: Path) -> None:
     assert logs == {path.stem for path in parts(tmp_path)}
     assert len(logs) > 1
     assert recording.path.with_suffix(".log").read_text().startswith("(")
+
+
+@settings(max_examples=20)
+@given(
+    boots=st.lists(
+        st.tuples(st.sampled_from([0.0, 0.0, 3.0, 1.7e9, 1.8e9]), st.floats(20.0, 40.0), st.booleans()),
+        min_size=2, max_size=6,
+    )
+)  # fmt: skip
+def test_the_newest_recordings_stay_whatever_the_clock_said(boots: list[tuple[float, float, bool]]) -> None:
+    """A computer without a battery begins each time in 1970, or at any date until a network has told it the time."""
+    with tempfile.TemporaryDirectory() as parent:
+        folder, in_order = Path(parent), list[Path]()
+        (folder / "demo-20269999-999999.rrd").touch()  # as nobody but a user names a file
+        for clock, up, is_box in boots:
+            wall = round((clock + up) * 1e9)
+            box = {"name": contents.box_name(wall * 1e-9), "reason": "x"} if is_box else {}
+            recording = Recorder(configured(), folder, live=False, wall_ns=lambda wall=wall: wall, **box)
+            recording.records(made.records(0.1).tobytes())
+            recording.close()
+            in_order.append(recording.path)
+        (folder / "demo-20269999-999999.rrd").unlink()
+        listed = [folder / name for session in find(recorded(folder)) for name in session.files]
+        assert listed == in_order
+        for path in in_order:
+            os.truncate(path, 1_000_000)
+        sessions, boxes = ([path for path in in_order if path.name.startswith("fault-") is of] for of in (False, True))
+        for left in reversed(range(len(in_order))):
+            assert retention.tidy(folder, left * 1e6).deleted == [[*sessions, *boxes][-1 - left]]
+
+
+def test_a_clock_that_is_right_gives_a_recording_its_date(tmp_path: Path) -> None:
+    kept(tmp_path, "demo-19700101-000030.rrd", 1)
+    kept(tmp_path, "best-29990101-000000-of-all.rrd", 1)
+    recording = recorder(tmp_path, Time(), configured())
+    recording.close()
+    assert recording.path.name == f"demo-{datetime.fromtimestamp(WALL_NS * 1e-9).astimezone():{retention.STAMP}}.rrd"
 
 
 # ---------------------------------------------------------------------- disks that fail, and kills

@@ -316,7 +316,8 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     """Format of the service's log lines: text for people, or JSON."""
     directory: Name = "recordings"
     """Folder for recordings. Its path is relative to the configuration file or, for shipped files, to the working
-    directory."""
+    directory. If the clock is behind the newest recording in the folder, as on a computer whose clock was not set, a
+    new one is named after the next second, so that names stay in order."""
     state_hz: Annotated[int, Meta(ge=1, le=200)] = 50
     """Rate at which the state is published [Hz]."""
     live_port: Annotated[int, Meta(ge=0, le=65535)] = 9876

@@ -6,7 +6,6 @@ a file next to the recording, called its sidecar, so that a search for sessions 
 
 from __future__ import annotations
 
-import re
 import stat
 from datetime import datetime
 from pathlib import Path
@@ -17,15 +16,10 @@ from msgspec import Meta
 from trirail_drivers import files
 
 from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
-from trirail.telemetry.retention import BLACK_BOX, robot_in, sidecar
+from trirail.telemetry.retention import BLACK_BOX, STAMP, robot_in, session_of, sidecar
 from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.messages import Event, FaultDetail, Notice, Outcome
 from trirail.wire.packets import Announcement, CheckRequest, CommandRequest, ControlInput, GoalRequest
-
-_PART = re.compile(r"-part\d+(-\d+)?$")
-STAMP = "%Y%m%d-%H%M%S"
-"""Format of the local time in a recording's name: its start time or, for a black box, the time of the fault."""
-
 
 WallTime = Annotated[float, Meta(ge=0.0, le=1e11)]
 """Time [s since 1970], before the year 5138."""
@@ -76,7 +70,7 @@ class Contents(msgspec.Struct):
     @property
     def session(self) -> str:
         """Name of the session to which the file belongs: the name of the session's first file, without suffix."""
-        return _PART.sub("", self.name.removesuffix(".rrd"))
+        return session_of(self.name)
 
     def add_cycles(self, began: float, ended: float, count: int) -> None:
         """Add `count` cycles, of which the first was at `began` and the last at `ended` [s since 1970]."""

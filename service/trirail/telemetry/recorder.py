@@ -20,10 +20,11 @@ from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.telemetry import contents, provenance, retention
 from trirail.telemetry.candump import CandumpLog
-from trirail.telemetry.contents import STAMP, Contents
+from trirail.telemetry.contents import Contents
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.journal import EVENTS, REQUESTS
 from trirail.telemetry.readout import ReadoutState
+from trirail.telemetry.retention import STAMP, name_in_order
 from trirail.telemetry.rotation import RotatedFiles, claim
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
@@ -65,7 +66,8 @@ class Recorder:
     config
         Configuration of the robot.
     directory
-        Folder of the files `<robot>-<date>-<time>.rrd`; rotated files also have `-part2` and so on in their names.
+        Folder of the files `<robot>-<date>-<time>.rrd`; rotated files also have `-part2` and so on in their names. If
+        the clock is behind the newest recording in the folder, the date is that of the next second after it.
     path
         File to write, instead of a new file in `directory`.
     name, reason
@@ -107,7 +109,8 @@ class Recorder:
         self._config = config
         self._is_black_box = name is not None
         self._own_folder = directory if path is None and name is None else None
-        session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():{STAMP}}"
+        dated = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():{STAMP}}"
+        session = name_in_order(directory, dated) if path is None else dated
         telemetry = config.telemetry
         self._streams = streams = Streams(DrawnRobot.from_config(config), session, self._wall_offset_ns)
         self._warn = warn or (lambda text: streams.log("warning", text.text))
@@ -145,8 +148,7 @@ class Recorder:
             streams.attach(self._live, LIVE_HZ)
             self.live_url = server.uri
         self._last: int | None = None
-        self._missed_cycles, self._reported = 0, (0, 0, 0)
-        self._next_check = 0
+        self._missed_cycles, self._reported, self._next_check = 0, (0, 0, 0), 0
         self._next_report = self._next_tidy = self._next_entry = 0.0
         self._tidy_error = ""
         self._reported_trouble = ""

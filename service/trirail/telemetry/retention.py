@@ -1,8 +1,10 @@
 """Retention of recordings: the oldest recordings are deleted when all recordings together need too much space.
 
 The age of a recording follows from the dates and numbers in its name, not from file times. On a machine without a
-battery-backed clock, file times can be wrong by years until the machine has received the network time. A file that is
-being written is locked, so that other processes do not delete the file.
+battery-backed clock, file times can be wrong by years until the machine has received the network time, which a machine
+without a network never does. The recorder does not wait for it. Instead, it never gives a new recording an earlier date
+than that of another recording in the folder. A file that is being written is locked, so that other processes do not
+delete the file.
 """
 
 from __future__ import annotations
@@ -12,19 +14,65 @@ import fcntl
 import os
 import re
 from collections.abc import Iterator
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
 
 BLACK_BOX = "fault-"
 """Prefix of the names of black boxes."""
+_PART = re.compile(r"-part\d+(-\d+)?$")
 _NAME = re.compile(
-    r"(?P<session>(?P<name>[A-Za-z0-9_-]+)-(?P<date>\d{8}-\d{6})(-(?P<number>\d+))?)"
+    r"(?P<name>[A-Za-z0-9_-]+)-(?P<date>\d{8}-\d{6})(-(?P<number>\d+))?"
     r"(-part(?P<part>\d+)(-(?P<again>\d+))?)?\.rrd"
 )
 """Pattern of the file names that the recorder chooses. Files with other names belong to users and are never deleted.
 
 The session and each part have a number if their name without it was in use.
 """
+
+
+STAMP = "%Y%m%d-%H%M%S"
+"""Format of the local time in a recording's name: its start time or, for a black box, the time of the fault."""
+
+
+class NameOrder(NamedTuple):
+    """Parts of the name of a recording, by which recordings are sorted in the order in which they were begun."""
+
+    date: str
+    name: str
+    number: int = 1
+    part: int = 1
+    again: int = 1
+
+
+def order_in(name: str) -> NameOrder | None:
+    """Return the place of a file name in the order of recordings; None for names that the recorder did not choose."""
+    match = _NAME.fullmatch(name)
+    if match is None:
+        return None
+    number, part, again = (int(match[key] or 1) for key in ("number", "part", "again"))
+    return NameOrder(match["date"], match["name"], number, part, again)
+
+
+def session_of(name: str) -> str:
+    """Return the name of the session of a recording: the name of the session's first file, without suffix."""
+    return _PART.sub("", name.removesuffix(".rrd"))
+
+
+def name_in_order(directory: Path, name: str) -> str:
+    """Return the name, without suffix, of a new recording in a folder, given a name with the present time.
+
+    If the clock is behind the newest recording, the new one is dated one second after that. Names that are no dates are
+    ignored.
+    """
+    own = order_in(f"{name}.rrd")
+    for newest in sorted(filter(None, (order_in(path.name) for path in directory.glob("*.rrd"))), reverse=True):
+        if own is None or own.date >= newest.date:
+            break
+        with contextlib.suppress(ValueError, OverflowError):
+            date = datetime.strptime(newest.date, STAMP)  # noqa: DTZ007 - local time, of which only the text is needed
+            return f"{own.name}-{date + timedelta(seconds=1):{STAMP}}"
+    return name
 
 
 def robot_in(name: str) -> str:
@@ -47,7 +95,7 @@ def delete(recording: Path) -> None:
 class _StoredRecording(NamedTuple):
     path: Path
     size: int
-    order: tuple[bool, bool, str, str, int, int, int]
+    order: tuple[bool, bool, NameOrder]
     """Sort key in the order of deletion.
 
     Recordings are sorted by date, number and part in their names, the running session after all others, and black boxes
@@ -141,15 +189,12 @@ def tidy(directory: Path, at_most: float, session: str = "") -> Tidied:
 
 def _recordings(directory: Path, session: str) -> Iterator[_StoredRecording]:
     for path in directory.glob("*.rrd"):
-        match = _NAME.fullmatch(path.name)
-        if match is None:
+        order = order_in(path.name)
+        if order is None:
             continue
         try:
             log = path.with_suffix(".log")
             size = path.stat().st_size + (log.stat().st_size if log.exists() else 0)
         except OSError:  # another process has just deleted the recording, or it is a link that leads nowhere
             continue
-        name, date = match["name"], match["date"]
-        number, part, again = (int(match[key] or 1) for key in ("number", "part", "again"))
-        own = match["session"] == session
-        yield _StoredRecording(path, size, (f"{name}-" == BLACK_BOX, own, date, name, number, part, again))
+        yield _StoredRecording(path, size, (f"{order.name}-" == BLACK_BOX, session_of(path.name) == session, order))

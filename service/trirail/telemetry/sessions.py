@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterable
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from msgspec import Struct
 
 from trirail.telemetry import contents
 from trirail.telemetry.contents import Contents
-from trirail.telemetry.retention import is_being_written
+from trirail.telemetry.retention import STAMP, NameOrder, is_being_written, order_in
 
 
 class SessionFilter(NamedTuple):
@@ -102,10 +103,19 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
 def find(files: Iterable[Contents], wanted: SessionFilter = SessionFilter()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
     """Return the sessions that match a filter, in the order of their start, given the contents of all files."""
     parts_of: dict[str, list[Contents]] = {}
-    for file in sorted(files, key=lambda file: (file.began is None, file.began or 0.0, file.name)):
+    for file in sorted(files, key=lambda file: _order(file, without_time="~")):
         parts_of.setdefault(file.session, []).append(file)
-    sessions = [_joined(parts) for parts in parts_of.values() if _is_wanted(parts, wanted)]
-    return sorted(sessions, key=lambda session: session.began or 0.0)
+    wanted_parts = [parts for parts in parts_of.values() if _is_wanted(parts, wanted)]
+    return [_joined(parts) for parts in sorted(wanted_parts, key=lambda parts: _order(parts[0], without_time=""))]
+
+
+def _order(file: Contents, without_time: str) -> tuple[NameOrder, float]:
+    """Return the sort key of a file: that in its name, which is right even if the clock was wrong, else its start."""
+    order = order_in(file.name)
+    if order is None:
+        began = without_time if file.began is None else f"{datetime.fromtimestamp(file.began).astimezone():{STAMP}}"
+        order = NameOrder(began, "")
+    return order, file.began or 0.0
 
 
 def unreadable(files: Iterable[Contents], matches: Iterable[RecordedSession]) -> list[str]:
