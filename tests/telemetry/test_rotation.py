@@ -12,6 +12,7 @@ import tempfile
 import warnings
 from collections import namedtuple
 from datetime import date, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -417,8 +418,8 @@ def test_the_newest_recordings_stay_whatever_the_clock_said(boots: list[tuple[fl
         (folder / "demo-20269999-999999.rrd").touch()  # as nobody but a user names a file
         for clock, up, is_box in boots:
             wall = round((clock + up) * 1e9)
-            box = {"name": contents.box_name(wall * 1e-9), "reason": "x"} if is_box else {}
-            recording = Recorder(configured(), folder, live=False, wall_ns=lambda wall=wall: wall, **box)
+            name, reason = (contents.box_name(wall * 1e-9), "x") if is_box else (None, None)
+            recording = Recorder(configured(), folder, live=False, name=name, reason=reason, wall_ns=partial(int, wall))
             recording.records(made.records(0.1).tobytes())
             recording.close()
             in_order.append(recording.path)
