@@ -19,11 +19,13 @@ Acceleration = Annotated[float, Meta(ge=1e-4, le=1e4)]
 """Acceleration [m/s²] or [rad/s²]."""
 Timeout = Annotated[float, Meta(ge=0.01, le=600.0)]
 """Time [s]."""
-Name = Annotated[str, Meta(max_length=4096, pattern=r"^[^\x00-\x1f\x7f]*$")]
+NO_LINE_BREAK: Final = r"(?!\n)"
+"""End of the patterns of names, since in Python "$" also matches before a line break at the end of a text."""
+Name = Annotated[str, Meta(max_length=4096, pattern=r"^[^\x00-\x1f\x7f]*$(?!\n)")]
 """Name of a file or a device, without control characters."""
 UnitName = Annotated[str, Meta(max_length=32)]
 """Unit of velocity or acceleration."""
-ProtectionName = Annotated[str, Meta(max_length=64, pattern=r"^([0-9A-F]{4}(:[0-9A-F]{2})?|[a-z_]+)$")]
+ProtectionName = Annotated[str, Meta(max_length=64, pattern=r"^([0-9A-F]{4}(:[0-9A-F]{2})?|[a-z_]+)$(?!\n)")]
 """Index of an object in hexadecimal, such as 605A, or name of an ODrive setting, such as enable_watchdog."""
 NodeId = Annotated[int, Meta(ge=0, le=127)]
 """Node id: CANopen allows 1 to 127, ODrive 0 to 62; the driver refuses other values."""
@@ -66,7 +68,7 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 OptionNumber = Annotated[int, Meta(ge=-(10**12), le=10**12)] | Annotated[float, Meta(ge=-1e12, le=1e12)]
-OptionName = Annotated[str, Meta(max_length=64, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+OptionName = Annotated[str, Meta(max_length=64, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$(?!\n)")]
 """Keyword argument of a python-can bus."""
 
 
@@ -137,7 +139,7 @@ class ObjectWrite(Struct, frozen=True, forbid_unknown_fields=True):
     """Value to write to the object."""
     type: Literal["u8", "u16", "u32", "i8", "i16", "i32"]
     """Data type, as given in the manufacturer's manual."""
-    why: Annotated[str, Meta(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+    why: Annotated[str, Meta(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$(?!\n)")]
     """Purpose, shown by `trirail drives`."""
     sub: Annotated[int, Meta(ge=0, le=255)] = 0
     """Subindex; 0 if the object has none."""

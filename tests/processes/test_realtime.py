@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from control_rig import CONFIG
 from trirail.processes import realtime
 
 
@@ -30,3 +31,17 @@ def test_memory_is_released_as_far_as_the_kernel_tells_what_there_is(monkeypatch
 
     monkeypatch.setattr(Path, "read_text", no_smaps)
     realtime.release_startup_memory()
+
+
+def test_a_file_for_sleep_states_that_cannot_be_opened_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a security module forbids what the file's mode allows."""
+    opened = []
+
+    def forbidden(path: str, flags: int) -> int:
+        opened.append(path)
+        raise PermissionError(1, "Operation not permitted", path)
+
+    monkeypatch.setattr(realtime, "_MEASURES", ())
+    monkeypatch.setattr(os, "open", forbidden)
+    assert realtime.acquire(CONFIG.loop) == ()
+    assert opened == ["/dev/cpu_dma_latency"]

@@ -9,6 +9,7 @@ import os
 import re
 import resource
 import selectors
+import shutil
 import signal
 import socket
 import subprocess
@@ -1028,3 +1029,30 @@ def test_a_stage_is_toured_summed_up_and_replayed_as_the_papers_robot_is(stage: 
     assert "the same to the last bit, in every cycle" in replayed.stdout
     assert trirail("export", file, "--every", "10ms", "--columns", "pose,error").returncode == 0
     assert len(file.with_suffix(".csv").read_text().splitlines()) > 100
+
+
+UNUSUAL = {"RERUN": "off", "NUMBA_DISABLE_JIT": "1"}
+"""What somebody's shell may have for other programs: Rerun would record nothing, and no function would be compiled."""
+
+
+class UnusualService(Service):
+    """A service with the environment of such a shell, whose folder has a name in another encoding."""
+
+    def start(self, path: Path, log: IO[bytes]) -> Process:
+        folder = Path(os.fsdecode(os.fsencode(path.parent) + b"/Ger\xe4te"))
+        folder.mkdir()
+        path = path.rename(folder / path.name)
+        command = python("-m", "trirail", "run", str(path))
+        return subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | UNUSUAL)
+
+
+def test_a_shell_made_for_other_programs_and_a_folder_in_another_encoding_change_nothing(tmp_path: Path) -> None:
+    with UnusualService(tmp_path, **{'directory = "recordings"': 'directory = "recordings"'}) as service:
+        service.wait_up()
+        with service.robot() as robot:
+            robot.command("enable")
+    assert service.process.returncode == 0
+    (recording,) = tmp_path.glob("Ger*/recordings/*.rrd")
+    copy = shutil.copy(recording, tmp_path / "copy.rrd")  # Rerun reads no file in a folder of such a name
+    assert len(read(Path(copy)).records) > 0
+    assert "recording to" in service.log.read_text()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -105,3 +106,12 @@ def test_parameters_go_over_the_wire_as_they_are(number: float, text: str) -> No
     for kind in (msgspec.json, msgspec.msgpack):
         assert kind.decode(kind.encode(told), type=Notice) == told
     assert len(str(made.params["text"])) <= MAX_PARAM
+
+
+def test_file_names_of_another_encoding_go_over_the_wire() -> None:
+    file = os.fsdecode(b"Ger\xe4te/robot.rrd")
+    event = coded(f"recording to {file}", EventCode.RECORDING, file=file)
+    packed = msgspec.msgpack.encode(Notice("service", "info", event.text, **event.fields))
+    notice = msgspec.msgpack.decode(packed, type=Notice)
+    assert notice.params == {"file": "Ger\\udce4te/robot.rrd"}
+    assert notice.message == "recording to Ger\\udce4te/robot.rrd"

@@ -50,7 +50,7 @@ Node = tuple[Error, Error, Error]
 Row = Annotated[tuple[Node, ...], Meta(min_length=4, max_length=11)]
 Face = Annotated[tuple[Row, ...], Meta(min_length=4, max_length=11)]
 Place = Annotated[float, Meta(ge=-100.0, le=100.0)]
-Words = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Words = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$(?!\n)")]
 
 
 class AsBuilt(Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,7 +61,7 @@ class AsBuilt(Struct, frozen=True, forbid_unknown_fields=True):
 
     made: Words
     """Date of the measurement."""
-    geometry: Annotated[str, Meta(pattern=r"^[0-9a-f]{8}$")]
+    geometry: Annotated[str, Meta(pattern=r"^[0-9a-f]{8}$(?!\n)")]
     """Checksum of the [geometry] used for the measurement, from `geometry_of`."""
     low: tuple[Place, Place, Place]
     """Lower bounds of the map in x, y [m] and phi [rad]."""

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 from msgspec import inspect as mi
-from trirail_drivers.config import Coordinate
+from trirail_drivers.config import NO_LINE_BREAK, Coordinate
 
 from trirail.config.tables import Angle, Config, ShapeError
 from trirail.quantities import as_familiar_unit
@@ -222,7 +222,7 @@ def expected(kind: mi.Type) -> str:
             return (
                 "text"
                 + (f" of {kind.max_length} characters at most" if kind.max_length else "")
-                + (f" matching {pattern}" if pattern else "")
+                + (f" matching {pattern.removesuffix(NO_LINE_BREAK)}" if pattern else "")
             )
         case mi.TupleType(item_types=types):
             return f"array of length {len(types)}"

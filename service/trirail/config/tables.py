@@ -31,11 +31,11 @@ Jerk = Annotated[float, Meta(ge=1e-3, le=1e6)]
 """Jerk [m/s³] or [rad/s³]."""
 BASE, PLATFORM = "base", "platform"
 """Names of the frames that every robot has."""
-FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-UserName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$(?!\n)")]
+UserName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$(?!\n)")]
 """Name of a user, the <user> in Zenoh keys."""
-PoseName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-Label = Annotated[str, Meta(pattern=r"^[^\W\d_][^\W_]{0,3}\Z")]
+PoseName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$(?!\n)")]
+Label = Annotated[str, Meta(pattern=r"^[^\W\d_][^\W_]{0,3}$(?!\n)")]
 """One to four letters and digits of any script, starting with a letter."""
 Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
@@ -44,7 +44,7 @@ Range = tuple[Coordinate, Coordinate]
 class RobotTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [robot]."""
 
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$(?!\n)")]
     """Name of the robot, the <robot> in every Zenoh key: letters, digits, - and _."""
 
 

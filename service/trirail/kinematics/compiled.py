@@ -12,7 +12,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from numba import njit
+from numba import config, njit
+
+# Some shells set NUMBA_DISABLE_JIT for debugging, but a cycle needs compiled code.
+config.DISABLE_JIT = 0  # type: ignore[attr-defined]
 
 __all__ = ["compile_no_more", "compiled", "inlined", "on_compile"]
 

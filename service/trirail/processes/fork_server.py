@@ -56,8 +56,9 @@ A terminal sends all but the last to all of its processes: on Ctrl-C, Ctrl-\\ an
 process in the background uses it. systemd sends SIGINT to all processes of a service to end it, also when the
 supervisor has died, and SIGABRT when the supervisor no longer feeds the watchdog.
 """
-ALLOCATOR_ENVIRONMENT: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
-"""Environment for Rerun's allocator, so that it does not reserve memory in advance."""
+RERUN_ENVIRONMENT: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0", "RERUN": "on"}
+"""Environment for Rerun: its allocator reserves no memory in advance, and it records, whatever the user's shell says.
+"""
 MAX_PACKET_BYTES = 4096
 """Maximum size of a packet on the control socket [bytes]."""
 
@@ -259,7 +260,7 @@ def serve(inheritance: Inheritance, work: Callable[[Child], int] = run) -> None:
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, [signal.SIGTERM])
-    os.environ.update(ALLOCATOR_ENVIRONMENT)
+    os.environ.update(RERUN_ENVIRONMENT)
     gc.disable()
     ForkServer(inheritance).serve(work)
 

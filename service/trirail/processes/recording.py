@@ -22,7 +22,7 @@ from trirail.processes.realtime import offer_to_oom_killer, release_startup_memo
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
-from trirail.wire.event_codes import EventCode, EventText, coded
+from trirail.wire.event_codes import EventCode, EventText, coded, encodable
 from trirail.wire.links import PACKETS_PER_TURN, LinkClosed, PacketLink
 from trirail.wire.messages import Level, Notice
 from trirail.wire.packets import (
@@ -139,7 +139,7 @@ class Intake:
                 box.latch("bus_load", answer.bus_load)
                 path = str(recorder.path)
                 self._announce("info", coded(f"recording to {path}", EventCode.RECORDING, file=path))
-                self._ready({"recording": str(recorder.path), "live": recorder.live_url})
+                self._ready({"recording": encodable(path), "live": recorder.live_url})
 
     def _warn(self, text: EventText) -> None:
         """Write a warning to the service's log, and announce it to all clients."""

@@ -28,7 +28,7 @@ from trirail.telemetry.retention import STAMP, name_in_order
 from trirail.telemetry.rotation import RotatedFiles, claim
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
-from trirail.wire.event_codes import EventCode, EventText, coded
+from trirail.wire.event_codes import EventCode, EventText, coded, encodable
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import SIZE, last_cycle
@@ -292,7 +292,7 @@ class Recorder:
         self._contents = Contents(path.name, self._config.robot.name, reason=self._reason)
         stream = self._streams.open(rr.FileSink(path))
         for entity, text in provenance.text_documents(self._config).items():
-            stream.log(entity, rr.TextDocument(text), static=True)
+            stream.log(entity, rr.TextDocument(encodable(text)), static=True)
         self._streams.resend_state()
         if self._frames:
             self._frames.turn(path.with_suffix(".log"))

@@ -154,11 +154,16 @@ class EventText(NamedTuple):
 
 def coded(text: str, code: EventCode, /, **params: float | str) -> EventText:
     """Return a text with its event code; `params` are the values that the code's `params` name."""
-    return EventText(text, code, {name: _plain(value) for name, value in params.items()})
+    return EventText(encodable(text), code, {name: _plain(value) for name, value in params.items()})
+
+
+def encodable(text: str) -> str:
+    """Return a text in which characters that UTF-8 lacks are escaped, as in file names of other encodings."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def _plain(value: float | str) -> float | str:
     """Convert a value to a string or a finite float, which JSON can represent; infinity and NaN become strings."""
     if isinstance(value, str):
-        return str(value)[:MAX_PARAM]
+        return encodable(value)[:MAX_PARAM]
     return float(value) if math.isfinite(value) else str(value)

@@ -25,8 +25,8 @@ Coordinates = tuple[Coordinate, Coordinate, Coordinate]
 Moment = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
 Clock = Annotated[float, Meta(ge=-1e11, le=1e11)]
 OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
-FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
-PoseName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
+FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$(?!\n)")]
+PoseName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$(?!\n)")]
 Tool = tuple[Coordinate, Coordinate] | FrameName
 """Point in the platform's frame, relative to the platform's centre [m], or the name of a point in [frames.tool]."""
 

@@ -17,7 +17,7 @@ from trirail.wire.sizes import MAX_NAME
 
 Length = Annotated[float, Meta(ge=0.0, le=1e3)]
 Duration = Annotated[float, Meta(ge=0.0, le=86_400.0)]
-OutputName = Annotated[str, Meta(pattern=rf"^[A-Za-z][A-Za-z0-9_-]{{0,{MAX_NAME - 1}}}$")]
+OutputName = Annotated[str, Meta(pattern=rf"^[A-Za-z][A-Za-z0-9_-]{{0,{MAX_NAME - 1}}}$(?!\n)")]
 PLACE_FIELDS = ("after_start", "after_start_s", "before_target", "before_target_s", "at_path_fraction", "at", "start")
 """Fields that specify the place of a mark; each mark has exactly one of these fields."""
 
