@@ -22,7 +22,7 @@ from trirail.motion.packing import unpack_run
 from trirail.motion.paths import Path
 from trirail.motion.runs import nominal_motion
 from trirail.motion.time_scaling import TimeScaling
-from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.goals import Goal, PoseGoal, TrackGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, GoalRequest, PlannerLost, Refused
 from trirail.wire.plan_packets import (
     PackedPath,
@@ -436,6 +436,50 @@ def test_a_jog_is_over_in_time_though_its_renewals_are_never_answered(rig: Contr
     assert rig.control.commanded.at_rest
     rig.cycles(SILENT)
     assert rig.mode is Mode.HOLDING
+
+
+@pytest.mark.parametrize("every", [10, 33])
+@pytest.mark.parametrize("delay", [4, 12, 19])
+def test_a_jog_goes_on_and_turns_round_though_its_renewals_come_faster_than_plans(
+    rig: ControlRig, meddler: Meddler, every: int, delay: int
+) -> None:
+    meddler.delays = [delay]
+    for number in range(60):
+        rig.post("j1", VelocityGoal(0.03 if number < 40 else -0.03, 0.0, 0.0, timeout=0.1))
+        rig.cycles(every - 1)
+    assert rig.outcomes() == []
+    assert rig.control.commanded.velocity[0] == pytest.approx(-0.03)
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("j1", "done")]
+    answered = [answer.ticket for answer in rig.answers if isinstance(answer, Accepted)]
+    assert len(set(answered)) == len(answered) == 60
+
+
+@pytest.mark.parametrize("goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)])
+def test_renewals_that_came_before_the_goal_began_are_all_replaced_by_a_newer_one(
+    rig: ControlRig, meddler: Meddler, goal: Goal
+) -> None:
+    meddler.delays = [60]
+    for _ in range(5):
+        rig.post("r1", goal)
+        rig.cycles(10)
+    rig.until(lambda: rig.mode is Mode.MOVING)
+    rig.cycle()  # the planner has the first renewal
+    rig.post("r1", goal)
+    assert len([answer for answer in rig.answers if isinstance(answer, Accepted)]) == 4
+    rig.cycles(130)
+    assert len(meddler.asked) == 3
+
+
+@pytest.mark.parametrize("goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)])
+def test_a_goal_that_is_renewed_does_not_wait_as_long_as_the_planning_before_it_took(
+    rig: ControlRig, meddler: Meddler, goal: Goal
+) -> None:
+    meddler.delays = [300, 2]
+    rig.post("g1", PoseGoal(0.08, 0.0, 0.0))
+    rig.cycles(400)
+    assert isinstance(rig.send("r1", goal, within=200), Accepted)
+    assert ("g1", "preempted") in rig.outcomes()
 
 
 class Silent(ControlRig):

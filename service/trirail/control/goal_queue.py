@@ -91,7 +91,7 @@ class GoalQueue:
         return min(math.floor(expiring) + 1 if math.isfinite(expiring) else math.inf, cycle + self._planner.due)
 
     def enqueue(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Add a goal to the queue. A frequent renewal replaces an earlier renewal that is still waiting.
+        """Add a goal to the queue. A renewal replaces the earlier renewals that are still waiting.
 
         Parameters
         ----------
@@ -105,9 +105,8 @@ class GoalQueue:
         sent = _ReceivedGoal(request, cycle - age)
         if self.idle:
             self._served.clear()
-        if request.goal.frequent and self._ledger.renewed_by(request):
-            before = next((other for other in self._waiting if self._ledger.renewed_by(other.request)), None)
-            if before is not None:
+        if self._ledger.renewed_by(request):
+            for before in [other for other in self._waiting if self._ledger.renewed_by(other.request)]:
                 self._waiting.remove(before)
                 self._ledger.pass_over(before.request)
         self._waiting.append(sent)

@@ -329,7 +329,10 @@ class PlanRequests:
         lead = self._leads[self._attempts]
         if self._attempts:
             return max(lead, LEAD_FACTOR * self._answer_cycles)
-        return max(lead, self._answer_cycles + 1) if goal.frequent else lead
+        if not goal.renewed:
+            return lead
+        # The last answer may be that of a lengthy goal, whose delay exceeds the time-out of a jog or track.
+        return max(lead, min(self._answer_cycles + 1, math.floor(0.5 * goal.timeout / self._period)))
 
     def _apply(self, answer: PlanAnswer) -> AcceptedPlan | None:
         """Apply the planner's answer once it is due. If the current motion no longer fits, drop the answer.

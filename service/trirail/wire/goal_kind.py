@@ -104,10 +104,11 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     follows: ClassVar[bool] = False
     """Whether the goal waits for a preceding goal that has a `blend`, instead of preempting it."""
     renewed: ClassVar[bool] = False
-    """Whether the goal lasts only while goals with the same kind, id and user renew it, each within its `timeout`."""
+    """Whether the goal lasts only while goals with the same kind, id and user renew it, each within its `timeout`. The
+    newest renewal replaces earlier renewals that still wait."""
     frequent: ClassVar[bool] = False
-    """Whether renewals are frequent. The newest renewal then replaces an earlier renewal that still waits. A refused
-    renewal does not end the goal, and only the first refusal is reported."""
+    """Whether renewals are frequent. A refused renewal then does not end the goal, and only the first refusal is
+    reported."""
     waits_at_end: ClassVar[bool] = False
     """Whether the goal stays active at the end of its path for as long as it is renewed."""
     timed: ClassVar[bool] = False
