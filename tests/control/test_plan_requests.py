@@ -285,6 +285,61 @@ def test_an_override_while_a_goal_is_planned_has_it_planned_from_the_new_motion(
     assert_within_limits(rig)
 
 
+@pytest.mark.parametrize("every", [5, 33])
+@pytest.mark.parametrize("blend", [None, 0.01])
+def test_a_goal_waits_until_the_override_is_lowered_no_more(
+    rig: ControlRig, meddler: Meddler, every: int, blend: float | None
+) -> None:
+    rig.send("g1", PoseGoal(0.08, 0.0, 0.0, blend=blend))
+    rig.cycles(150)
+    meddler.delays = [10]
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    for percent in range(95, 45, -5):
+        rig.order("override", percent / 100)
+        rig.cycles(every - 1)
+    rig.until(rig.holds)
+    assert [outcome for _, outcome in rig.outcomes()] == ["preempted" if blend is None else "done", "done"]
+    assert_within_limits(rig)
+
+
+def test_a_jog_goes_on_while_the_override_is_lowered(rig: ControlRig, meddler: Meddler) -> None:
+    meddler.delays = [10]
+    for number in range(40):
+        rig.post("j1", VelocityGoal(0.05, 0.0, 0.0, timeout=0.3))
+        rig.cycles(20)
+        rig.order("override", 1.0 - 0.02 * number)
+        rig.cycles(10)
+    assert (rig.mode, rig.outcomes()) == (Mode.MOVING, [])
+
+
+@pytest.mark.parametrize("overtaken", [False, True])
+def test_a_goal_during_whose_planning_the_override_is_changed_for_ever_is_refused_with_the_reason(
+    rig: ControlRig, meddler: Meddler, monkeypatch: pytest.MonkeyPatch, overtaken: bool
+) -> None:
+    """The planner answers too late, or not at all because each request is overtaken by the next."""
+    monkeypatch.setattr("trirail.control.plan_requests.PLANNING_TIMEOUT_S", 1.0)
+    rig.send("g1", PoseGoal(0.12, 0.0, 0.0, speed=0.02))
+    rig.cycles(200)
+    meddler.asked.clear()
+    meddler.delays = [30]
+    if overtaken:
+        meddler.change = lambda _: []
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    answered = len(rig.answers)
+    for number in range(60):
+        rig.order("override", 1.0 - 0.002 * number)
+        rig.cycles(24)
+    (refused,) = [answer for answer in rig.answers[answered:] if isinstance(answer, Refused)]
+    assert refused.code == "no_plan"
+    assert "no plan was ready within 1 s while the motion was changing" in refused.message
+    assert len(meddler.asked) > 10
+    assert not any("the planner is busy" in notice.message for notice in rig.notices)
+    assert dict(rig.outcomes()) == {"g2": "rejected"}
+    meddler.change = lambda answer: [answer]
+    rig.order("override", 1.0)
+    assert isinstance(rig.send("g3", PoseGoal(0.0, 0.05, 0.0), within=500), Accepted)
+
+
 def test_a_motion_that_begins_elsewhere_is_never_begun(rig: ControlRig, meddler: Meddler) -> None:
     """It has the right number and the right version: where the robot is to be then it does not begin."""
     moving(rig)

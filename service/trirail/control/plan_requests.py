@@ -38,7 +38,8 @@ the first request, the others for its repetitions."""
 MIN_LEAD_CYCLES = 2
 """Shortest time between a request and the start of the motion [cycles]. An answer arrives at least one cycle later."""
 PLANNING_TIMEOUT_S = 8.0
-"""Longest wait for an answer of the planner [s]. The end of the planner process is reported without this delay."""
+"""Longest wait for an answer of the planner, or for a motion that does not change while the goal is planned [s]. The
+end of the planner process is reported without this delay."""
 BUSY_AFTER_S = 0.5
 """Time without an answer after which the planner is reported as busy [s]."""
 LEAD_FACTOR = 2
@@ -96,9 +97,11 @@ class PlanRequests:
         """Latest answer that has been prepared, and its motion."""
         self._lost: str | None = None
         self._attempts = 0
+        """Number of plans that were too late, or did not fit the motion for which they were requested."""
         self._answer_cycles = 0
         """Delay of the last answer [cycles]."""
         self._since: int | None = None
+        """Cycle of the first request for the current goal since the last of these plans."""
         self._change: RateChange | None = None
         self._wanted_rate = 0.0
         """Rate to which the current motion has been changed last, as far as its limits allow."""
@@ -136,8 +139,9 @@ class PlanRequests:
 
     @property
     def silence(self) -> float:
-        """Time since the first unanswered request for the current goal [s]."""
-        return (self._schedule.cycle - self._since) * self._period if self._since is not None else 0.0
+        """Time since the latest request for the current goal, if it has not been answered [s]."""
+        asked = self._request
+        return self._seconds_since(asked.cycle) if asked is not None and self._answer is None else 0.0
 
     @property
     def busy_message(self) -> str:
@@ -170,7 +174,7 @@ class PlanRequests:
 
     def cancel(self) -> None:
         """Stop planning the goal, and ignore answers that arrive later."""
-        self._goal = self._request = self._answer = self._planned_run = self._lost = self._since = None
+        self._goal = self._request = self._answer = self._planned_run = self._lost = None
 
     @property
     def needs_old_motion(self) -> bool:
@@ -211,7 +215,7 @@ class PlanRequests:
         """Store the first answer to the latest request; ignore all other answers."""
         asked = self._request
         if asked is not None and (answer.number, answer.version) == (asked.number, asked.version) and not self._answer:
-            self._answer, self._since = answer, None
+            self._answer = answer
             if self._prepared[0] is not answer:
                 self.prepare(answer)
             _, self._planned_run = self._prepared
@@ -219,7 +223,7 @@ class PlanRequests:
 
     def fail(self, reason: str) -> None:
         """Record that the planner will not answer, so that `step` refuses the goal."""
-        if self._since is not None:
+        if self.awaits_answer:
             self._lost = reason
 
     def step(self) -> AcceptedPlan | None:
@@ -232,10 +236,7 @@ class PlanRequests:
         self._change_rate()
         if self._goal is None:
             return None
-        if self.silence > PLANNING_TIMEOUT_S:
-            raise RefusedError(
-                RefusalCode.EXPIRED, f"{self.busy_message}: send the goal again when the machine is less busy"
-            )
+        self._check_wait()
         if self._lost is not None:
             raise RefusedError(RefusalCode.PLANNER_LOST, f"{self._lost}: send the goal again")
         if self._request is not None and self._request.version != self._schedule.version:
@@ -249,6 +250,24 @@ class PlanRequests:
         return self._apply(self._answer) if self._answer is not None else None
 
     # ------------------------------------------------------------------ inside
+
+    def _seconds_since(self, cycle: int) -> float:
+        return (self._schedule.cycle - cycle) * self._period
+
+    def _check_wait(self) -> None:
+        """Raise RefusedError if the goal has waited too long for an answer that fits the present motion."""
+        if self._answer is not None or self._since is None or self._seconds_since(self._since) <= PLANNING_TIMEOUT_S:
+            return
+        if self.busy_message:
+            raise RefusedError(
+                RefusalCode.EXPIRED, f"{self.busy_message}: send the goal again when the machine is less busy"
+            )
+        # A request that is dropped because the motion has changed is not one of the attempts.
+        text = (
+            f"no plan was ready within {PLANNING_TIMEOUT_S:g} s while the motion was changing: "
+            "send the goal again when the override no longer changes"
+        )
+        raise RefusedError(RefusalCode.NO_PLAN, text)
 
     @property
     def _rate(self) -> float:
@@ -301,7 +320,7 @@ class PlanRequests:
             self._change = None
 
     def _request_plan(self, goal: Goal) -> None:
-        """Request a motion from the current motion to the goal. Raises RefusedError after too many requests."""
+        """Request a motion from the current motion to the goal. Raises RefusedError after too many attempts."""
         if self._attempts == len(self._leads):
             text = f"no plan was ready in time in {self._attempts} attempts: send the goal again"
             raise RefusedError(RefusalCode.NO_PLAN, text)
@@ -320,7 +339,6 @@ class PlanRequests:
             goal,
             None if schedule.ended else self._blend,
         )
-        self._attempts += 1
         self._since = self._since if self._since is not None else schedule.cycle
         self._port.request_plan(self._request)
 
@@ -356,7 +374,7 @@ class PlanRequests:
         if planned.first is not None and schedule.cycle < planned.first:
             return None  # not due yet
         if planned.first is not None and schedule.cycle > planned.first:
-            self._request = None  # too late
+            self._try_again()  # too late
             return None
         run = self._planned_run or unpack_run(self._legs, planned.run)
         run.own = self._own_bounds
@@ -365,7 +383,7 @@ class PlanRequests:
         if planned.reply.stops_first and schedule.runs:
             runs.appendleft(self._stopping(schedule.runs[0], planned))
         if not self._continues(runs):
-            self._request = None
+            self._try_again()
             return None
         schedule.replace_runs(runs)
         # The goal begins in this cycle, and the mode changes to moving.
@@ -374,6 +392,11 @@ class PlanRequests:
         if run.target != self._rate:
             self._start_rate_change()
         return AcceptedPlan(planned.reply, planned.bound)
+
+    def _try_again(self) -> None:
+        """Drop the planner's answer, and let `step` request another plan with a longer lead."""
+        self._request = self._since = None
+        self._attempts += 1
 
     def _stopping(self, under_way: Run, planned: PreemptingMotion) -> Run:
         """Return a copy of the current motion that stops on its path, without the goals that follow on the path."""
@@ -411,7 +434,7 @@ class PlanRequests:
             or run.law_state.s >= extended.s
             or not _same(nominal_motion(run.path, extended.s), nominal_motion(path, 0.0))
         ):
-            self._request = None
+            self._try_again()
             return None
         schedule.append(extended.s, path, self._marks(extended.switches), self._own_bounds)
         return AcceptedPlan(extended.reply.with_duration(schedule.remaining if run.target else math.inf))
