@@ -527,6 +527,36 @@ def test_what_was_renewed_and_refused_goes_on_to_say_why(rig: ControlRig, goal: 
     assert "rejected: the robot is disabled: send enable first); start a new goal" in answer.message
 
 
+@pytest.mark.parametrize("waiting", [False, True])
+def test_a_jog_that_a_refused_renewal_ends_says_why(rig: ControlRig, waiting: bool) -> None:
+    """In its events and answers, while it brakes and afterwards; another renewal may wait behind the refused one."""
+    rig.enable()
+    jog = VelocityGoal(0.1, 0.0, 0.0, timeout=0.5)
+    rig.send("j1", jog)
+    rig.cycles(100)
+    rig.notices.clear()
+    rig.post("j1", VelocityGoal(0.4, 0.0, 0.0, timeout=0.5))
+    if waiting:
+        rig.post("j1", jog)
+    rig.until(lambda: rig.mode is Mode.STOPPING)
+    while_braking = rig.send("j1", jog)
+    assert rig.mode is Mode.STOPPING
+    rig.until(rig.holds)
+    answers = [while_braking, rig.send("j1", jog)]
+    why = "400 mm/s in x is above the limit of 250 mm/s"
+    assert [getattr(answer, "code", None) for answer in answers] == ["jog_over"] * 2
+    assert all(why in refused(answer) for answer in answers)
+    told = [
+        said.message for said in rig.notices if said.kind in ("mode", "goal") and said.message != "holding: standstill"
+    ]
+    assert len(told) == 2
+    assert all(why in message for message in told)
+    assert rig.outcomes() == [("j1", "done")]
+    (end,) = [said for said in rig.notices if said.kind == "goal"]
+    assert (end.code, end.event_code, end.value, end.limit) == ("above_limit", "refused", 0.4, 0.25)
+    assert not any("not renewed" in text for text in (*told, *map(refused, answers)))
+
+
 def test_what_is_refused_in_fault_says_which_and_only_there(rig: ControlRig) -> None:
     rig.enable()
     assert "fault" not in refused(rig.command("resume"))

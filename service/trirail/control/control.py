@@ -467,8 +467,11 @@ class Control:
             released = self.ledger.release(self.modes.cycle) if self.state.mode is Mode.MOVING else None
             if released is not None:
                 words = f"goal {released.id} of {released.user} was not renewed in time"
-                late = coded(words, EventCode.NOT_RENEWED, goal=released.id, user=released.user)
-                self.modes.apply_event(ModeEvent.NOT_RENEWED, late)
+                reason = coded(words, EventCode.NOT_RENEWED, goal=released.id, user=released.user)
+                if released.refusal is not None:
+                    words = f"a renewal of goal {released.id} of {released.user} was refused: {released.refusal}"
+                    reason = coded(words, EventCode.REFUSED)
+                self.modes.apply_event(ModeEvent.NOT_RENEWED, reason)
             beginning = self.goal_queue.step(self.modes.cycle, self._admit, self._place)
             if beginning is not None:
                 words = f"goal {beginning.id} of {beginning.user}"

@@ -51,6 +51,8 @@ class ActiveGoal(NamedTuple):
     """Last cycle of the goal if the goal is not renewed."""
     released: bool = False
     """Whether the goal was not renewed in time. A late renewal cannot revive the goal."""
+    refusal: RefusedError | None = None
+    """Refusal of a renewal, which has ended the goal; None if there is none."""
     bound: str | None = None
     """Name of the limit that stops a jog, or that the target of a track exceeds."""
     settles: bool = True
@@ -66,13 +68,17 @@ class ActiveGoal(NamedTuple):
 
 
 class _GoalEnd(NamedTuple):
-    """Summary of a goal that has ended. `bound` is the limit at which a jog has ended."""
+    """Summary of a goal that has ended.
+
+    `bound` is the limit at which a jog has ended, `refusal` the refusal of the goal or of its renewal.
+    """
 
     user: str
     kind: type[Goal]
     outcome: Outcome
     reason: str
     bound: str | None
+    refusal: RefusedError | None
 
     def renewal_error(self, goal_id: str) -> RefusedError:
         """Return the error for a renewal that arrives after the end of this goal."""
@@ -80,7 +86,7 @@ class _GoalEnd(NamedTuple):
             text = f"jog {goal_id!r} has ended at the limit of {self.bound}: start a new jog away from this limit"
             return RefusedError(RefusalCode.AT_LIMIT, text)
         if self.outcome == "done":
-            return _not_renewed(goal_id)
+            return _not_renewed(goal_id, self.refusal)
         text = f"goal {goal_id!r} has ended ({self.outcome}: {self.reason}); start a new goal"
         return RefusedError(RefusalCode.JOG_OVER, text)
 
@@ -119,7 +125,7 @@ class Ledger:
                 RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has already been used: give every goal its own id"
             )
         if self.goal is not None and self.goal.released and self.renewed_by(request):
-            raise _not_renewed(goal_id)
+            raise _not_renewed(goal_id, self.goal.refusal)
 
     def pass_over(self, request: GoalRequest) -> None:
         """Answer a renewal as accepted although a newer renewal has replaced it."""
@@ -130,11 +136,14 @@ class Ledger:
 
         A goal that ends because a renewal was refused is not extended.
         """
-        if self.renewed_by(request) and self.goals[0].alive_until > -math.inf:
+        if self.renewed_by(request) and self.goals[0].refusal is None:
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
     def release(self, cycle: int) -> ActiveGoal | None:
-        """Return the current goal if the goal was not renewed in time. Each goal is returned only once."""
+        """Return the current goal if it was not renewed in time, or if a renewal was refused.
+
+        Each goal is returned only once.
+        """
         goal = self.goal
         if goal is None or goal.released or cycle <= goal.alive_until:
             return None
@@ -214,8 +223,13 @@ class Ledger:
             goal = self.goals.popleft()
             at_limit = outcome == "done" and not goal.released and not goal.kind.waits_at_end
             bound = goal.bound if at_limit else None
-            text = coded(f"at the limit of {bound}", EventCode.STOPPED_AT_LIMIT) if bound else reason
-            self._end_goal(goal.id, goal.user, goal.kind, outcome, text, bound, settled)
+            refusal = goal.refusal if outcome == "done" and bound is None else None
+            text = reason
+            if bound is not None:
+                text = coded(f"at the limit of {bound}", EventCode.STOPPED_AT_LIMIT)
+            elif refusal is not None:
+                text = coded(f"a renewal was refused: {refusal}", EventCode.REFUSED)
+            self._end_goal(goal.id, goal.user, goal.kind, outcome, text, bound, settled, refusal)
         self.goals.extend(kept)
 
     def note_edge(self, reason: EventText) -> None:
@@ -266,7 +280,7 @@ class Ledger:
             if self.renewed_by(request):
                 self.notices.append(_refused(text, request.user, refusal))
                 if not request.goal.frequent:  # a refused renewal also ends the goal
-                    self.keep_alive(request, -math.inf)
+                    self.goals[0] = self.goals[0]._replace(alive_until=-math.inf, refusal=refusal)
             else:
                 reason = coded(text, EventCode.REFUSED)
                 self._end_goal(request.id, request.user, type(request.goal), outcome, reason, refusal=refusal)
@@ -296,7 +310,7 @@ class Ledger:
             return
         self._on_end(goal_id, outcome)
         level = _LEVELS.get(outcome, "info")
-        self._ended[goal_id] = _GoalEnd(user, kind, outcome, reason.text, bound)
+        self._ended[goal_id] = _GoalEnd(user, kind, outcome, reason.text, bound, refusal)
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
         words = f"goal {goal_id} {outcome}: {reason}"
@@ -352,7 +366,11 @@ def _with_code(notice: Notice, refusal: RefusedError) -> Notice:
     return structs.replace(notice, **about)
 
 
-def _not_renewed(goal_id: str) -> RefusedError:
+def _not_renewed(goal_id: str, refusal: RefusedError | None) -> RefusedError:
+    """Return the error for a renewal of a goal that was not renewed in time, or that a refused renewal has ended."""
+    if refusal is not None:
+        text = f"goal {goal_id!r} has ended because a renewal was refused ({refusal}); start a new goal"
+        return RefusedError(RefusalCode.JOG_OVER, text)
     return RefusedError(
         RefusalCode.JOG_OVER, f"goal {goal_id!r} was not renewed in time and has ended: start a new goal"
     )

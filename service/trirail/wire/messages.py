@@ -155,7 +155,8 @@ class Notice(Struct, frozen=True, omit_defaults=True):
     alignment: AlignmentLook | None = None
     """If the kind is alignment, the look of the alignment."""
     code: RefusalCode | None = None
-    """If the kind is refused, or if a goal was rejected, the reason as a code for programs."""
+    """If the kind is refused, or if a goal was rejected or ended by a refused renewal, the reason as a code for
+    programs."""
     slider: str | None = None
     """Slider that the code concerns, A, B or C; None if the code does not concern a single slider."""
     value: float | None = None
