@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
+import random
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -39,6 +41,7 @@ from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.dictionary import ObjectEntry
 from trirail_drivers.simulated.faults import Faults
+from trirail_drivers.simulated.homing import HomingMode, Phase
 from trirail_drivers.simulated.profile import MakersRules
 from waiting import WITHIN
 
@@ -285,6 +288,93 @@ def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pyte
         moved = max(moved, abs(true_positions(rig)[0] - before))
     assert moved > 5e-5
     rig.until(lambda: rig.mode is Mode.HOLDING)
+
+
+def with_target_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let drives show bit 10 at standstill in their setpoint mode too, as some makers do."""
+    publish = SimulatedDrive._publish
+
+    def shown(self: SimulatedDrive) -> None:
+        publish(self)
+        if self._profile.mode.value == 8 and self.servo.velocity == 0.0:
+            self._profile.statusword.value |= 1 << 10
+
+    monkeypatch.setattr(SimulatedDrive, "_publish", shown)
+
+
+@pytest.mark.core
+def test_a_statusword_of_the_setpoint_mode_that_comes_after_the_start_ends_no_homing(rig: Rig) -> None:
+    rig.enable()
+    begin(rig)
+    rig.until(lambda: rig.drives[0].homing.under_way)
+    rig.bus._emit(canopen_frames.TPDO1 + 1, canopen_frames.STATUSWORD.pack(0x1637))
+    rig.until(lambda: rig.mode is not Mode.HOMING)
+    assert rig.control.measured.feedback.homed == (True, True, True)
+    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+
+
+LATEST = 0.0125
+"""How late statuswords come at most [s]: that of a drive that updates its PDO every 12.5 ms."""
+
+
+@pytest.mark.parametrize("keeps", [False, True])
+@pytest.mark.parametrize("method", [19, 37])
+@pytest.mark.parametrize("reordered", [False, True])
+@pytest.mark.generated(2, 0, 1)
+def test_late_statuswords_end_no_homing(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch, seed: int, reordered: bool, method: int, keeps: bool
+) -> None:
+    """Bits 12 and 10 of a statusword of the setpoint mode, or of the last homing, do not show that home was found."""
+    drawn, late, arrivals = random.Random(seed), False, dict[int, float]()
+    share = drawn.random()
+    rig: Rig
+
+    def delay(message: can.Message) -> float:
+        can_id, waits = message.arbitration_id, 0.0
+        if can_id & 0x780 != canopen_frames.TPDO1 or not late:
+            return 0.0
+        if drawn.random() < share:
+            waits = drawn.uniform(0.0, LATEST)
+        if not reordered:
+            waits = max(waits, arrivals.get(can_id, 0.0) - rig.now)
+        arrivals[can_id] = rig.now + waits
+        return waits
+
+    with_target_reached(monkeypatch)
+    rig = robots(incremental(method), delay)
+    rig.enable()
+    for drive in rig.drives if keeps else ():
+        # A drive that shows its last homing until the next one starts.
+        monkeypatch.setattr(drive.homing, "forget", partial(setattr, drive.homing, "phase", Phase.IDLE))
+        monkeypatch.setattr(drive.homing, "start", partial(started_again, drive.homing))
+    for goal in ("g1", "g2"):
+        late = True
+        rig.cycles(drawn.randrange(100))
+        begin(rig)
+        begun = [False] * 3
+        while rig.mode is Mode.HOMING:
+            rig.cycle()
+            for n, homed in enumerate(rig.control.measured.feedback.homed):
+                begun[n] = begun[n] or rig.drives[n].homing.phase is not Phase.IDLE or method == 37
+                assert begun[n] or not homed
+        rig.cycles(50)
+        if reordered and "does not follow setpoints" in (rig.control.fault or ""):
+            return  # a statusword of homing mode came last; the robot has stopped
+        assert rig.control.fault is None
+        assert rig.control.measured.feedback.homed == (True, True, True)
+        expected = true_positions(rig) if method == 19 else HOMES
+        assert rig.control.measured.feedback.position == pytest.approx(expected, abs=2e-7)
+        late = False
+        rig.cycles(50)
+        settled(rig)
+        assert isinstance(rig.goal(goal, 0.01, 0.0, 0.05), Accepted)
+        rig.until(rig.holds)
+
+
+def started_again(homing: HomingMode, *given: Any) -> None:
+    """Start homing; only this clears the result of the last homing."""
+    homing.attained = homing.failed = False
+    HomingMode.start(homing, *given)
 
 
 @pytest.mark.parametrize("method", [35, 37])

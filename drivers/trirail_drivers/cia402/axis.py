@@ -133,7 +133,7 @@ class Cia402Axis(Axis):
         self.unanswered = 0
         self._answers_after.forget()
 
-    def note_request(self, now: float) -> None:
+    def note_request(self, now: float, request: bytes) -> None:
         """Record an SDO request."""
         if not self.unanswered:
             self.unanswered_since = now

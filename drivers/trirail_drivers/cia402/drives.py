@@ -520,7 +520,7 @@ class Cia402(Driver[Cia402Axis]):
         """Send an SDO request; return whether the bus accepted it."""
         sent = self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, request))
         if sent:
-            axis.note_request(self._clock())
+            axis.note_request(self._clock(), request)
         return sent
 
     @property

@@ -45,6 +45,7 @@ _ABORTED: Final = 0x80
 
 _TARGET_REACHED: Final = 1 << 10
 _HOMING_ATTAINED: Final = 1 << 12
+_ATTAINED: Final = _HOMING_ATTAINED | _TARGET_REACHED
 _ERROR: Final = 1 << 13
 """Statusword bits in homing mode. In other modes, these bits have other meanings."""
 
@@ -152,43 +153,47 @@ class HomingSequence:
             yield from self._wait_for_syncs(axis)
         yield from self._change_mode(axis, HOMING)
         axis.follows = False
-        # The newest statusword may have been sent in another mode, in which its bits have other meanings.
-        yield from self._sdo(axis, _READ, _STATUSWORD)
-        axis.seen_clear = ~axis.statusword
+        result = _Result((yield from self._read_statusword(axis)))
         started = axis.sampled + FRESH_ANSWERS
 
-        def home_attained() -> bool:
+        def in_place() -> bool:
             # Homing in place may end before any statusword shows it. At home, the drive counts from 0.
-            in_place = homing.method in HOME_IN_PLACE and axis.sampled >= started and abs(axis.actual) <= axis.still
-            return _attained(axis, seen=in_place)
+            return homing.method in HOME_IN_PLACE and axis.sampled >= started and abs(axis.actual) <= axis.still
 
-        if not self._stopping:
-            axis.mode_bits = canopen_frames.HOMING_START
-            yield from self._wait_until(
-                lambda: self._stopping or home_attained(), homing.timeout, "home was not reached"
-            )
-        attained = home_attained()
-        if not attained:
+        attained = False
+        if self._stopping:
             yield from self._halt(axis)
+        else:
+            axis.mode_bits = canopen_frames.HOMING_START
+            deadline = self._now + homing.timeout
+            while not (self._stopping or attained):
+                if self._now >= deadline:
+                    raise HomingFailedError(f"home was not reached within {homing.timeout:g} s")
+                yield
+                if result.differs_from(axis.statusword) or in_place():
+                    result.update((yield from self._read_statusword(axis)))
+                    attained = result.attained(seen=in_place())
+            if not attained:
+                result.update((yield from self._halt(axis)))
+                attained = result.attained(seen=in_place())
         axis.mode_bits = 0
         yield from self._follow_setpoints(axis)
         axis.homed = attained
 
-    def _halt(self, axis: Cia402Axis) -> Steps:
+    def _halt(self, axis: Cia402Axis) -> Generator[None, None, int]:
+        """Halt the drive; return its statusword at standstill."""
         axis.mode_bits = canopen_frames.HALT
-        answered = axis.sampled + FRESH_ANSWERS
-        yield from self._wait_until(
-            lambda: axis.sampled >= answered and bool(axis.statusword & _TARGET_REACHED),
-            self._stop_timeout,
-            "the slider did not stop",
-        )
+        deadline = self._now + self._stop_timeout
+        yield from self._wait_for_answers(axis)
+        while not (statusword := (yield from self._read_statusword(axis))) & _TARGET_REACHED:
+            if self._now >= deadline:
+                raise HomingFailedError(f"the slider did not stop within {self._stop_timeout:g} s")
+            yield
+        return statusword
 
     def _follow_setpoints(self, axis: Cia402Axis) -> Steps:
         """Switch back to the setpoint mode once the drive's setpoint equals its actual position."""
-        answered = axis.sampled + FRESH_ANSWERS
-        yield from self._wait_until(
-            lambda: axis.sampled >= answered, self._sdo_timeout, "the drive sent no new position"
-        )
+        yield from self._wait_for_answers(axis)
         standing = axis.actual
         yield
         # The control loop has received this position. From now on it sends this position, as this sequence did before.
@@ -196,8 +201,12 @@ class HomingSequence:
         axis.follows = True
         yield from self._wait_for_syncs(axis)
         yield from self._change_mode(axis, axis.exchange.mode)
-        if axis.exchange.tells_following:  # bit 12 of the newest statusword may still have its meaning in homing mode
-            yield from self._sdo(axis, _READ, _STATUSWORD)
+        if axis.exchange.tells_following:
+            # A statusword of homing mode, in which bit 12 has another meaning, may be the newest, or may still arrive.
+            # Thus bit 12 counts as set only if both ways show it; otherwise the drive has FOLLOW_TIME to set it.
+            shown = axis.statusword
+            shown &= yield from self._read_statusword(axis)
+            axis.statusword &= shown | ~canopen_frames.FOLLOWS_SETPOINTS
         axis.cyclic = True
         axis.held = None
 
@@ -210,6 +219,15 @@ class HomingSequence:
             if self._now >= deadline:
                 raise HomingFailedError(f"object 6061:00 (Modes of operation display): expected {mode}, found {shown}")
 
+    def _read_statusword(self, axis: Cia402Axis) -> Generator[None, None, int]:
+        """Read the statusword by SDO, in the mode that `_change_mode` has confirmed.
+
+        A statusword that is received by PDO may have been sent before, in another mode, in which its bits have other
+        meanings. SDO answers are never late: the drive sends them in the order of the requests.
+        """
+        answer = yield from self._sdo(axis, _READ, _STATUSWORD)
+        return int.from_bytes(answer[4:6], "little")
+
     def _sdo(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
         """Perform one SDO transfer over several cycles, without blocking; return the answer.
 
@@ -218,8 +236,9 @@ class HomingSequence:
         while axis.unanswered and not axis.forget_lost_requests(self._now):
             yield
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
-        if self._send(Frame(canopen_frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value])))):
-            axis.note_request(self._now)
+        request = _SDO.pack(command, index, 0, bytes([value]))
+        if self._send(Frame(canopen_frames.SDO_REQUEST + axis.node, request)):
+            axis.note_request(self._now, request)
         deadline = self._now + self._sdo_timeout
         while (answer := axis.sdo_answer) is None:
             if self._now >= deadline:
@@ -236,6 +255,13 @@ class HomingSequence:
         applied = axis.syncs + SETPOINT_SYNCS
         yield from self._wait_until(lambda: axis.syncs >= applied, self._sdo_timeout, "no SYNC was sent")
 
+    def _wait_for_answers(self, axis: Cia402Axis) -> Steps:
+        """Wait until the drive's position is certain to be newer than the last step."""
+        answered = axis.sampled + FRESH_ANSWERS
+        yield from self._wait_until(
+            lambda: axis.sampled >= answered, self._sdo_timeout, "the drive sent no new position"
+        )
+
     def _wait_until(self, reached: Callable[[], bool], seconds: float, otherwise: str) -> Steps:
         deadline = self._now + seconds
         while not reached():
@@ -244,13 +270,30 @@ class HomingSequence:
             yield
 
 
-def _attained(axis: Cia402Axis, *, seen: bool) -> bool:
-    """Whether the drive has found home.
+class _Result:
+    """Result of one homing, shown by the statuswords that the drive has sent in homing mode.
 
-    Bits 12 and 13 may still be set from an earlier homing, so they must have been clear since this homing began. Bit 12
-    need not have been clear if the result of this homing has been `seen` otherwise.
+    Bits 12 and 13 may still be set from an earlier homing, so they must have been clear since this homing began.
     """
-    if axis.statusword & axis.seen_clear & _ERROR:
-        raise HomingFailedError(f"the drive reports a homing error (statusword {axis.statusword:04X})")
-    both = _HOMING_ATTAINED | _TARGET_REACHED
-    return axis.statusword & both == both and (seen or bool(axis.seen_clear & _HOMING_ATTAINED))
+
+    def __init__(self, statusword: int) -> None:
+        """`statusword` is that before the start."""
+        self._statusword, self._seen_clear = statusword, ~statusword
+
+    def update(self, statusword: int) -> None:
+        """Handle a later statusword. Raises HomingFailedError if it shows an error."""
+        self._statusword = statusword
+        self._seen_clear |= ~statusword
+        if statusword & self._seen_clear & _ERROR:
+            raise HomingFailedError(f"the drive reports a homing error (statusword {statusword:04X})")
+
+    def differs_from(self, statusword: int) -> bool:
+        """Whether a statusword of uncertain mode may show another result, so that it must be read by SDO."""
+        return bool((statusword ^ self._statusword) & (_ATTAINED | _ERROR))
+
+    def attained(self, *, seen: bool) -> bool:
+        """Whether the drive has found home.
+
+        Bit 12 need not have been clear if the result of this homing has been `seen` otherwise.
+        """
+        return self._statusword & _ATTAINED == _ATTAINED and (seen or bool(self._seen_clear & _HOMING_ATTAINED))

@@ -36,8 +36,6 @@ class AxisRow(ctypes.Structure):
     """Time of the last statusword [s]."""
     statusword: int
     """Newest statusword."""
-    seen_clear: int
-    """Bits of the statusword that have been 0 since the driver cleared this field."""
     syncs: int
     """Number of SYNCs sent."""
     sampled: int

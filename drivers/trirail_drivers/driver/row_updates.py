@@ -86,7 +86,6 @@ def accept_turns(row: AxisRow, turns: float) -> None:
 def accept_statusword(row: AxisRow, statusword: int, now: float) -> None:
     """Store a received statusword; `now` is the time of reception [s]."""
     row.statusword, row.status_heard = statusword, now
-    row.seen_clear |= ~statusword
 
 
 def due_setpoint(row: AxisRow, commanded: NDArray[np.float64]) -> float:
