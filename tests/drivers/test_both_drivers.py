@@ -138,6 +138,25 @@ def test_a_drive_that_gets_power_by_itself_is_named_with_its_state(ready: AnyRig
     assert again.message == said
 
 
+def test_a_drive_that_is_left_out_and_gets_power_stops_the_one_that_is_enabled(ready: AnyRig) -> None:
+    ready.drives.enable("A")
+    ready.cycles(300)
+    ready.keep_power(1)
+    ready.get_power(1)
+    said = f"drive B: {ready.keeps_power.format('it got power by itself')}"
+    assert ready.found("timeout", within=1150) == ("B", "timeout", 0, said)
+    assert ready.cycles(500).state[0] == OFF[0]
+
+
+def test_a_drive_that_is_left_out_and_has_power_for_a_moment_stops_no_other(ready: AnyRig) -> None:
+    ready.drives.enable("A")
+    ready.cycles(300)
+    ready.get_power(1)  # it obeys, and loses its power again
+    feedback = ready.cycles(2500)
+    assert feedback.fault is None
+    assert feedback.state == (ENABLED[0], *OFF[1:])
+
+
 def test_nothing_is_enabled_while_a_fault_is_latched(enabled: AnyRig) -> None:
     enabled.bus.faults.add("A fault 200")
     assert enabled.cycles(240).fault is not None

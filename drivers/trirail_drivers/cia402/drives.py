@@ -548,8 +548,9 @@ class Cia402(Driver[Cia402Axis]):
     def _describe_protection(protection: str) -> str:
         return describe_protection(protection)
 
-    def _powered(self) -> bool:
-        return any(axis.state in HAS_POWER for axis in self._axes)
+    @staticmethod
+    def _has_power(axis: Cia402Axis) -> bool:
+        return axis.state in HAS_POWER
 
 
 def _target_of(axis: Cia402Axis, wanted: canopen_frames.TargetState) -> canopen_frames.TargetState:

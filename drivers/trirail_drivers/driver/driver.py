@@ -229,9 +229,14 @@ class Driver(ABC, Generic[AnyAxis]):
     def _describe_protection(protection: str) -> str:
         """Return the purpose of a protection in words."""
 
-    @abstractmethod
     def _powered(self) -> bool:
         """Whether any drive has power, as far as is known."""
+        return any(self._has_power(axis) for axis in self._axes)
+
+    @staticmethod
+    @abstractmethod
+    def _has_power(axis: AnyAxis) -> bool:
+        """Whether a drive has power, as far as is known."""
 
     @abstractmethod
     def _wants_power(self) -> bool:
@@ -306,19 +311,23 @@ class Driver(ABC, Generic[AnyAxis]):
 
     def _check_stopped(self, now: float) -> None:
         """Latch a fault for the first drive that has power `stop_timeout` after it should have none. Only its brake can
-        stop it. The time also runs for a drive that has got power without a command.
+        stop it. The time also runs for a drive that has got power without a command, and for one that is left out.
         """
-        times, unwanted = self._times, self._powered() and not self._wants_power()
+        times, enabled = self._times, self._wants_power()
+        off = [axis for axis in self._axes if axis.left_out or not enabled]
+        unwanted = any(self._has_power(axis) for axis in off)
         if times.off_deadline == math.inf and unwanted and not self._power_reported:
             self._start_stop_timer("it got power by itself")
         if now < times.off_deadline:
             return
         times.off_deadline = math.inf
-        self._abandon_stop()
-        for axis in self._axes:
+        if not enabled:
+            self._abandon_stop()
+        for axis in off:
             fault = axis.stop_overdue_fault(self._stop_reason, self._drives.stop_timeout)
             if fault is not None:
                 self._wire.fault = fault
+                self._stop()
                 return
 
     @property

@@ -298,8 +298,9 @@ class Odrive(Driver[OdriveAxis]):
     def _describe_protection(protection: str) -> str:
         return describe_protection(protection)
 
-    def _powered(self) -> bool:
-        return any(axis.powered for axis in self._axes)
+    @staticmethod
+    def _has_power(axis: OdriveAxis) -> bool:
+        return axis.powered
 
     def _abandon_stop(self) -> None:
         self._setpoints.abandon()
