@@ -220,6 +220,10 @@ class DriverRig(Cycles[AnyDriver], ABC, Generic[AnyDevice, AnyDriver]):
     def get_power(self, index: int) -> None:
         """Give a drive power without a command."""
 
+    @abstractmethod
+    def keep_fault(self, index: int) -> Callable[[], None]:
+        """Let a drive ignore resets, as while its cause persists; return what ends that."""
+
     def enable(self) -> Feedback:
         self.drives.enable()
         for _ in range(self.enabled_within):

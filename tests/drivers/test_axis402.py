@@ -60,6 +60,31 @@ def test_a_fault_reset_has_the_time_of_two_statuswords() -> None:
     assert axis.find_fault(T + 0.26, OFF) == ("B", "fault", 0, "drive B: fault")
 
 
+def test_a_reset_under_way_gets_no_more_time_and_the_next_one_has_an_edge() -> None:
+    """CiA 402-2, transition 15: a rising edge of bit 7 resets a fault."""
+    axis = made()
+    axis.on_status(FAULT, T)
+    for at in (T, T + 0.1, T + 0.199):
+        axis.clear_faults(at)
+        axis.controlword = axis.word(at, OFF)
+        assert axis.controlword == canopen_frames.FAULT_RESET
+    axis.clear_faults(T + 0.201)  # bit 7 has not fallen yet
+    assert axis.find_fault(T + 0.201, OFF) is not None
+    axis.controlword = axis.word(T + 0.201, OFF)
+    assert not axis.controlword & canopen_frames.FAULT_RESET
+    axis.clear_faults(T + 0.202)
+    assert axis.word(T + 0.202, OFF) == canopen_frames.FAULT_RESET
+
+
+def test_requests_for_the_error_register_in_quick_succession_hide_no_error() -> None:
+    axis = made()
+    axis.on_emergency(ERROR, T)
+    axis.clear_faults(T)
+    axis.clear_faults(T + REGISTER_TIME - 0.01)
+    axis.on_status(ENABLED, T + REGISTER_TIME)
+    assert axis.find_fault(T + REGISTER_TIME, OFF) is not None
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_quick_stop_ends_without_power_once_the_slider_has_stood_for_a_tenth_of_a_second(sign: int) -> None:
     """It stands where it stays within 20 µm; while it moves by more the drive keeps its power, and brakes."""

@@ -157,6 +157,37 @@ def test_a_drive_that_is_left_out_and_has_power_for_a_moment_stops_no_other(read
     assert feedback.state == (ENABLED[0], *OFF[1:])
 
 
+@pytest.mark.parametrize("every", [1, 40, 100, 150])
+def test_resets_in_quick_succession_hide_no_fault_and_end_it_with_its_cause(enabled: AnyRig, every: int) -> None:
+    end = enabled.keep_fault(1)
+    enabled.devices[1].fail(0x3210)
+    enabled.cycles(100)
+
+    def faults(cycles: int) -> set[str | None]:
+        found = set()
+        for number in range(cycles):
+            if number % every == 0:
+                enabled.drives.reset()
+            fault = enabled.cycle().fault
+            found.add(fault and fault.cause)
+        return found
+
+    assert "fault" in faults(1200)
+    end()
+    faults(2400)  # the last reset before the end has its time
+    assert faults(300) == {None}
+    assert enabled.drives.read().state == OFF
+
+
+def test_resets_in_quick_succession_do_not_hide_a_drive_that_keeps_its_power(enabled: AnyRig) -> None:
+    enabled.keep_power(1)
+    enabled.drives.disable()
+    for _ in range(10):
+        enabled.drives.reset()
+        fault = enabled.cycles(101).fault
+    assert fault == ("B", "timeout", 0, f"drive B: {enabled.keeps_power.format('disable')}")
+
+
 def test_nothing_is_enabled_while_a_fault_is_latched(enabled: AnyRig) -> None:
     enabled.bus.faults.add("A fault 200")
     assert enabled.cycles(240).fault is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,12 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
 
     def get_power(self, index: int) -> None:
         self.devices[index].state = P.OPERATION_ENABLED
+
+    def keep_fault(self, index: int) -> Callable[[], None]:
+        device = self.devices[index]
+        control, on_write = device._control, device.objects.on_write
+        on_write(0x6040, lambda entry, old: None if device.state is P.FAULT else control(entry, old))
+        return lambda: on_write(0x6040, control)
 
 
 @pytest.fixture

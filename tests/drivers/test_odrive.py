@@ -74,6 +74,12 @@ class Rig(DriverRig[SimulatedOdrive, Odrive]):
     def get_power(self, index: int) -> None:
         self.devices[index].axis_state = AxisState.CLOSED_LOOP_CONTROL
 
+    def keep_fault(self, index: int) -> Callable[[], None]:
+        handlers = self.devices[index]._handlers
+        clear = handlers[cansimple.CLEAR_ERRORS]
+        handlers[cansimple.CLEAR_ERRORS] = lambda data: None
+        return lambda: handlers.update({cansimple.CLEAR_ERRORS: clear})
+
     def commands(self) -> list[list[tuple[int, int]]]:
         """What each drive was told: number and first byte of each command, without setpoints and requests."""
         sent = [(divmod(can_id, 32), data) for can_id, data in self.bus.sent]

@@ -413,16 +413,22 @@ class Cia402Axis(Axis):
         return self.left_operational or self.missed > 0
 
     def clear_faults(self, now: float) -> None:
-        """Forget the latched event, but not a condition that persists, and give a fault reset time to take effect."""
+        """Forget the latched event, but not a condition that persists, and give a fault reset time to take effect.
+
+        A reset under way gets no more time: only a rising edge of bit 7 resets a fault (CiA 402-2, transition 15), so
+        bit 7 must fall before the next reset. Nor does a request for the error register.
+        """
         self._answers_after.forget()
         if self.configured:
             self.event = None
-        if self.state is PowerState.FAULT:
+        resets = now < self.reset_until or self.controlword & canopen_frames.FAULT_RESET
+        if self.state is PowerState.FAULT and not resets:
             self.reset_until = now + RESET_TIME
         if self.error_code and self.state not in _IN_FAULT:
             # After an EMCY without a following "error reset", only the error register shows whether the error is over.
             self.register_wanted = True
-            self._register_until = now + REGISTER_TIME
+            if now >= self._register_until:
+                self._register_until = now + REGISTER_TIME
 
     def word(self, now: float, wanted: canopen_frames.TargetState) -> int:
         """Return the controlword for the drive's next transition towards `wanted`, at time `now` [s]."""

@@ -439,7 +439,7 @@ class Cia402(Driver[Cia402Axis]):
         """
         self._wire.reset()
         now = self._clock()
-        if self._wanted is not PowerState.OPERATION_ENABLED:
+        if self._wanted is not PowerState.OPERATION_ENABLED and self._times.off_deadline == math.inf:
             self._start_stop_timer("reset")
         for axis in self._axes:
             if axis.configured and axis.has_missed_start(self._period):

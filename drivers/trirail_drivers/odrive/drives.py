@@ -273,14 +273,15 @@ class Odrive(Driver[OdriveAxis]):
         """
         self._wire.reset()
         now = self._clock()
-        if not self._enabled:
+        if not self._enabled and self._times.off_deadline == math.inf:
             self._start_stop_timer("reset")
         for axis in self._axes:
             if not axis.configured:
                 continue
             axis.event = None
             if axis.errors or not self._enabled:  # errors of a drive that has lost power may not be known yet
-                axis.reset_until = now + RESET_TIME
+                if now >= axis.reset_until:  # a reset under way gets no more time, so that its failure becomes known
+                    axis.reset_until = now + RESET_TIME
                 self._clear_errors(axis)
 
     def _clear_errors(self, axis: OdriveAxis) -> None:
