@@ -6,6 +6,8 @@ import math
 
 import msgspec
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Cia402Axis
 from trirail_drivers.cia402.one_drive import HAS_POWER
@@ -83,6 +85,33 @@ def test_requests_for_the_error_register_in_quick_succession_hide_no_error() -> 
     axis.clear_faults(T + REGISTER_TIME - 0.01)
     axis.on_status(ENABLED, T + REGISTER_TIME)
     assert axis.find_fault(T + REGISTER_TIME, OFF) is not None
+
+
+SWITCHED_ON = b"\x33\x02"
+frames_of_a_statusword = st.lists(st.sampled_from(["changes", "PDO", "request", "answer"]), max_size=30)
+
+
+@given(frames_of_a_statusword)
+@example(["request", "changes", "PDO", "answer"])
+def test_an_older_statusword_by_sdo_replaces_no_newer_one_by_pdo(events: list[str]) -> None:
+    """The drive samples its statusword when it gets a request, and when it sends a PDO, which overtakes the answer."""
+    axis, words = made(), (ENABLED, SWITCHED_ON)
+    newest = number = 0
+    sampled: list[int] = []
+    for event in events:
+        if event == "changes":
+            number += 1
+        elif event == "PDO":
+            axis.on_status(words[number % 2], T)
+            newest = number
+        elif event == "request" and not sampled:
+            axis.note_request(T, canopen_frames.STATUSWORD_UPLOAD)
+            sampled = [number]
+        elif event == "answer" and sampled:
+            newest = max(newest, sampled[0])
+            axis.on_sdo(canopen_frames.STATUSWORD_UPLOADED + words[sampled.pop() % 2] + bytes(2), T)
+        (expected,) = canopen_frames.STATUSWORD.unpack(words[newest % 2])
+        assert axis.statusword == expected
 
 
 @pytest.mark.parametrize("sign", [1, -1])

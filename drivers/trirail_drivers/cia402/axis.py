@@ -103,6 +103,11 @@ class Cia402Axis(Axis):
         """Time of the next statusword request, and time until which the error register may arrive [s]."""
         self.register_wanted = False
         """Whether the drive's error register 1001h must be requested."""
+        self._statusword_asked = self._overtaken = False
+        """Whether the statusword has been requested by SDO, and whether it has arrived by PDO since then.
+
+        The PDO may be newer than the answer, since it has a higher priority on the bus.
+        """
         self._operational = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
         self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfterStop()
@@ -131,10 +136,13 @@ class Cia402Axis(Axis):
         """Forget the last power state, and stop looking for positions of another node, since a new set-up begins."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.unanswered = 0
+        self._statusword_asked = self._overtaken = False
         self._answers_after.forget()
 
     def note_request(self, now: float, request: bytes) -> None:
         """Record an SDO request."""
+        if request == canopen_frames.STATUSWORD_UPLOAD:
+            self._statusword_asked, self._overtaken = True, False
         if not self.unanswered:
             self.unanswered_since = now
         self.unanswered += 1
@@ -187,6 +195,7 @@ class Cia402Axis(Axis):
         accept_counts(self, counts, now)
         self.answer()
         if statusword is not None:
+            self._overtaken = self._statusword_asked
             self.update_status(statusword, now)
         self._operational = True  # CiA 301: PDOs are sent only in NMT operational
 
@@ -249,7 +258,9 @@ class Cia402Axis(Axis):
         if canopen_frames.is_upload(data, canopen_frames.MODE_DISPLAY_UPLOADED) and self.awaits_mode:
             self._update_mode(data[4])
         elif canopen_frames.is_upload(data, canopen_frames.STATUSWORD_UPLOADED):
-            self._on_statusword(data[4:6], now)
+            if not self._overtaken:
+                self._on_statusword(data[4:6], now)
+            self._statusword_asked = self._overtaken = False
         elif data[:4] == canopen_frames.OUTPUTS_REFUSED:
             code = int.from_bytes(data[4:8], "little")
             self.note_fault("state", 0, f"refuses its digital outputs, object 60FE:01 (SDO abort {code:08X})")
@@ -287,6 +298,7 @@ class Cia402Axis(Axis):
         if self.exchange.inputs is not None and self.exchange.inputs == self.exchange.status:
             self.on_inputs(data[2:], now)
             data = data[:2]
+        self._overtaken = self._statusword_asked
         self._on_statusword(data, now)
 
     def on_inputs(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
