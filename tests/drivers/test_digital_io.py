@@ -19,6 +19,7 @@ from drivers.test_foreign import Rig as ForeignRig
 from rigs import STANDSTILL, STEP, Closing
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.inspection import inspect
+from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.driver.row_updates import OUTPUT_REPEATS
 from trirail_drivers.errors import BusError, DriveError
@@ -223,6 +224,25 @@ def switched_on(rig: Rig) -> Rig:
 def test_the_end_of_the_service_makes_outputs_safe(rig: Rig) -> None:
     switched_on(rig).drives.close()
     assert rig.devices[0].pins.bits == LAMP
+
+
+@pytest.mark.parametrize("power", [False, True])
+@pytest.mark.parametrize("cycles", [0, 1, 5, 300])
+@pytest.mark.parametrize("nmt", [Nmt.STOPPED, Nmt.PRE_OPERATIONAL])
+def test_the_end_of_the_service_makes_outputs_safe_in_every_nmt_state(
+    rig: Rig, nmt: Nmt, cycles: int, power: bool
+) -> None:
+    """The drive may have left NMT operational just before, so that no heartbeat has shown it yet."""
+    switched_on(rig)
+    if not power:
+        rig.drives.disable()
+        rig.cycles(20)
+    rig.devices[0]._enter(nmt)
+    for _ in range(cycles):
+        rig.cycle()
+    rig.drives.close()
+    assert rig.devices[0].pins.bits == LAMP
+    assert rig.devices[0].state not in HAS_POWER
 
 
 def test_an_output_sticks_on_demand(rig: Rig) -> None:

@@ -341,7 +341,10 @@ class Cia402(Driver[Cia402Axis]):
                 axis.poll_due = now + canopen_frames.POLL_PERIOD  # another request could overwrite this one
 
     def _make_outputs_safe(self) -> None:
-        """Write the safe values of the outputs and wait for the answers. SDOs also work in NMT pre-operational."""
+        """Write the safe values of the outputs and wait for the answers.
+
+        The drives are in NMT pre-operational, in which they receive SDOs; in NMT stopped, they would not.
+        """
         self.set_outputs([axis.io.safe for axis in self._axes])
         asked = [axis for axis in self._axes if axis.has_outputs and axis.present]
         self._await_answers(asked)  # a server handles one request at a time (CiA 301)

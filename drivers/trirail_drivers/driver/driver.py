@@ -201,10 +201,11 @@ class Driver(ABC, Generic[AnyAxis]):
                 if self._powered():
                     self.quick_stop()
                     self._wait_for_standstill(self._clock() + self._drives.stop_timeout)
-                self._make_outputs_safe()
         finally:
             try:
                 self._cut_power()
+                with contextlib.suppress(can.CanError, OSError):
+                    self._make_outputs_safe()
             finally:
                 self._wire.close()
 
