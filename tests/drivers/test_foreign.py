@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 from rigs import STANDSTILL, Closing, Cycles, alike
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
+from trirail_drivers.cia402 import sdo_client
 from trirail_drivers.cia402.canopen_frames import CONTROLWORD, ENABLE_OPERATION, INTERPOLATE
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.objects import FOLLOWING_BIT, USES
@@ -309,6 +311,28 @@ def test_an_answer_against_the_rules_is_not_told_as_silence(closing: Closing, mo
     with pytest.raises(DriveError, match=r"drive A: cannot read object 1000:00 .*: Toggle bit") as told:
         rig.ready()
     assert not isinstance(told.value, DriveTimeout)
+
+
+@pytest.mark.parametrize("piece", [b"1234567", b""], ids=["full", "empty"])
+@pytest.mark.parametrize("size", [10, None])
+def test_a_transfer_that_never_ends_is_refused(
+    closing: Closing, monkeypatch: pytest.MonkeyPatch, size: int | None, piece: bytes
+) -> None:
+    rig = closing(Rig("elmo_gold"))
+    served, toggles = rig.nodes[0].local.sdo, itertools.cycle((0, 0x10))
+    answer: Callable[[bytes], None] = served.send_response
+
+    def endless(data: bytes) -> None:
+        if data[0] == 0x43:
+            answer(b"\x40\x00\x10\x00" + bytes(4) if size is None else b"\x41\x00\x10\x00" + bytes([size, 0, 0, 0]))
+        else:
+            answer(bytes([next(toggles) | (7 - len(piece)) << 1]) + piece.ljust(7, b"\0"))
+
+    monkeypatch.setattr(sdo_client, "MAX_UPLOAD", 64)
+    monkeypatch.setattr(served, "send_response", endless)
+    announced = size or "no size"
+    with pytest.raises(DriveError, match=rf"A: cannot read object 1000:00 .* without an end, {announced} announced"):
+        rig.ready()
 
 
 def test_a_segment_that_is_not_answered_is_aborted_by_its_object(

@@ -21,6 +21,8 @@ MAX_SECOND_ANSWERS: Final = 10
 """Number of second answers within one set-up that proves that there are two nodes with the same id."""
 EXPEDITED: Final = 4
 """Maximum size of a value in an expedited transfer [bytes]."""
+MAX_UPLOAD: Final = 1 << 16
+"""Maximum size of a value that is read [bytes]. Texts and numbers are far smaller; no domain is read."""
 ABORT_PAUSE_S: Final = 0.002
 """Pause after an abort, during which the drive handles the abort [s]."""
 
@@ -88,7 +90,8 @@ class Client:
     async def upload(self, index: int, subindex: int) -> bytes:
         """Read an object. Some drives pad a shorter value to four bytes.
 
-        Raises SdoAbortedError if the drive refuses, NoAnswerError, and SdoCommunicationError for other failures.
+        Raises SdoAbortedError if the drive refuses, NoAnswerError, and SdoCommunicationError for other failures, such
+        as segments that never end.
         """
         answer = await self._request(struct.pack("<BHBI", _UPLOAD << 5, index, subindex, 0))
         if answer[0] & _IS_EXPEDITED:
@@ -101,9 +104,14 @@ class Client:
             if answer[0] & _TOGGLE != toggle:
                 self._abort(index, subindex, code=_NOT_ALTERNATED)
                 raise SdoCommunicationError("Toggle bit mismatch")
-            content += answer[1 : 8 - (answer[0] >> 1 & 7)]
+            segment = answer[1 : 8 - (answer[0] >> 1 & 7)]
+            content += segment
             if answer[0] & _LAST:
                 break
+            if not segment or len(content) > min(MAX_UPLOAD, MAX_UPLOAD if size is None else size):
+                self._abort(index, subindex, code=_GENERAL_ABORT)
+                announced = "no size" if size is None else f"{size}"
+                raise SdoCommunicationError(f"{len(content)} bytes received without an end, {announced} announced")
             toggle ^= _TOGGLE
         if size not in (None, len(content)):
             raise SdoCommunicationError(f"{len(content)} bytes received, {size} announced")
