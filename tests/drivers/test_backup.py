@@ -46,7 +46,7 @@ TEXT, OCTET_STRING, DOMAIN = 0x09, 0x0A, 0x0F
 VOLATILE = {0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1F50, 0x1F51, 0x6040, 0x6042, 0x6060, 0x6071, 0x607A, 0x60B0,
             0x60B1, 0x60B2, 0x60B8, 0x60C1, 0x60FF}  # fmt: skip
 """What these dictionaries let be written that no drive keeps: targets, offsets, controlwords, commands."""
-HOMING = {0x607C, 0x6098, 0x6099, 0x609A}
+HOMING = {0x605D, 0x607C, 0x6098, 0x6099, 0x609A}
 """Objects that set-up writes only where a drive has homing, which these have not."""
 OUTPUT_MASK = 0x60FE, 2
 OWNED = {int(name[:4], 16) for name in USES} - HOMING | {0x60B0, 0x60B2}
@@ -309,7 +309,7 @@ def test_a_file_that_ends_within_its_last_value_is_refused(make: str, tmp_path: 
     "end",
     [
         "[OptionalObjects]",
-        "SupportedObjects=47",
+        "SupportedObjects=48",
         "1=0x1003",
         "[ManufacturerObjects]",
         "SupportedObjects=0",

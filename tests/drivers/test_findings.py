@@ -126,6 +126,7 @@ KEEPS: dict[Key, tuple[str, int]] = {
     (0x1007, 0): ("refused", 500),
     (0x607C, 0): ("refused", 5000),
     (0x1029, 1): ("protection", 1),
+    (0x605D, 0): ("protection", 0),
     (0x6066, 0): ("protection", 500),
     (0x1800, 3): ("noted", 50),
     (0x609A, 0): ("noted", 7),
@@ -172,6 +173,46 @@ def test_a_value_that_a_drive_keeps_is_not_told_as_a_missing_object(key: Key, ap
             fit(line, key, value)._limits = None
             line.drives = replace(line.drives, A=replace(line.drives.A, accept_without=(f"{key[0]:04X}",)))
             assert set_up(line, apply=apply)["lacking"] == [f"{key[0]:04X}"]
+
+
+@pytest.mark.parametrize("key", [(0x6007, 0), (0x605E, 0)])
+@pytest.mark.parametrize("apply", [False, True])
+def test_a_drive_that_can_only_coast_is_told_of(key: Key, apply: bool) -> None:
+    """6007h = 2 and 605Eh = 0 are accepted where the drive accepts nothing better."""
+    with Line(SERVO) as line:
+        fit(line, key, 2 if key[0] == 0x6007 else 0)._limits = None
+        found = set_up(line, apply=apply)
+    assert not found["refused"]
+    assert [title(key) in str(each) and "the drive coasts" in str(each) for each in found["notes"]] == [True]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("held", "then"), [(0, 1), (1, 1), (2, 1), (4, 1), (None, None)])
+def test_a_halt_of_homing_brakes(held: int | None, then: int | None) -> None:
+    """605Dh; a drive without the object has a stop of its own."""
+    with Line(SERVO) as line:
+        entry = fit(line, (0x605D, 0), held or 0)
+        if held is None:
+            del line.objects._entries[0x605D, 0]
+        found = set_up(line, apply=True)
+    assert not found["refused"]
+    assert held is None or entry.value == then
+    assert any("605D" in str(each) for each in found["notes"]) == (held is None)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("held", [2, 3, 4])
+def test_a_drive_may_keep_another_halt_that_brakes(held: int) -> None:
+    with Line(SERVO) as line:
+        fit(line, (0x605D, 0), held)._limits = None
+        found = set_up(line, apply=True)
+    assert not found["refused"]
+    assert not found["lacking"]
+
+
+def test_a_drive_without_homing_keeps_its_halt() -> None:
+    with Line(SERVO) as line:
+        line.objects[0x605D, 0].value = 0
+        assert not set_up(line, apply=True)["refused"]
+        assert line.objects[0x605D, 0].value == 0
 
 
 @settings(max_examples=20)

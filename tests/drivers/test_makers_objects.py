@@ -128,7 +128,7 @@ def configured(folder: Path, lines: str, example: str = "elmo_gold") -> Path:
 
 
 WHY = 'why = "…"'
-HOMING = {"607C", "6098", "6099", "609A"}
+HOMING = {"605D", "607C", "6098", "6099", "609A"}
 OWNED = sorted(
     {name[:4] for name in USES} - HOMING | {"1010", "1011", "100B", "1600", "1A03", "60A9", "60AA", "60B0", "60B2"}
 )

@@ -15,7 +15,7 @@ from trirail_drivers.errors import DriveError
 _STORES: Final = "would store parameters in the drive, or restore stored ones"
 _ADDRESS: Final = "changes node id or bitrate, for which the manufacturer's tool is needed"
 _FORBIDDEN: Final = {0x1010: _STORES, 0x1011: _STORES, 0x100B: _ADDRESS}
-_HOMING: Final = (0x607C, 0x6098, 0x6099, 0x609A)
+_HOMING: Final = (0x605D, 0x607C, 0x6098, 0x6099, 0x609A)
 """Objects that the set-up writes only for a drive with homing."""
 UNITS: Final = (0x60A9, 0x60AA)
 """Units of velocity and acceleration. The set-up writes them only for drives whose unit cannot be converted."""

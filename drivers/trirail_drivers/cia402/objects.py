@@ -75,6 +75,13 @@ USES: Final = {
     "6040": ObjectUse(_N, "Controlword", "power, stop, reset", "refused"),
     "6041": ObjectUse(_N, "Statusword", "its state", "refused"),
     "605A": ObjectUse(_P, "Quick stop option code", "its quick-stop ramp", "its own stop"),
+    "605D": ObjectUse(
+        _R,
+        "Halt option code",
+        "a ramp when homing is stopped",
+        "its own stop",
+        (_P, "it may coast when homing is stopped"),
+    ),
     "605E": ObjectUse(_P, "Fault reaction option code", "the ramp of its faults", "its own stop"),
     "6060": ObjectUse(_N, "Modes of operation", "the mode", "refused"),
     "6061": ObjectUse(_N, "Modes of operation display", "the mode", "refused"),
@@ -118,13 +125,13 @@ PROTECTIONS: Final = {
 _WIDTHS: Final = {
     **dict.fromkeys((0x1001, 0x1019, 0x1029, 0x6060, 0x6061, 0x6098, 0x60C2), 1),
     **dict.fromkeys((0x100C, 0x1015, 0x1017, 0x603F, 0x6040, 0x6041), 2),
-    **dict.fromkeys((0x6007, 0x605A, 0x605E, 0x6066, 0x60B2, 0x60C0), 2),
+    **dict.fromkeys((0x6007, 0x605A, 0x605D, 0x605E, 0x6066, 0x60B2, 0x60C0), 2),
     0x100D: 1,
 }
 """Size of each object's value [bytes] if it is not four (CiA 301, CiA 402-2)."""
 _SIGNED: Final = frozenset(
-    (0x6007, 0x605A, 0x605E, 0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x6098, 0x60B0, 0x60B1, 0x60B2, 0x60C0, 0x60C1)
-)
+    (0x6007, 0x605A, 0x605D, 0x605E, 0x6060, 0x6061, 0x6064, 0x607A, 0x607B, 0x607C, 0x607D, 0x6098, 0x60C0, 0x60C1)
+) | {0x60B0, 0x60B1, 0x60B2}
 
 
 def width(key: Key) -> int:

@@ -120,6 +120,8 @@ def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
 
 DISABLE_VOLTAGE_OPTION: Final = 2
 """Value of 6007h with which a drive that has lost its master removes power without a ramp."""
+DISABLE_DRIVE_OPTION: Final = 0
+"""Value of 605Eh with which a drive in fault removes power without a ramp."""
 MAX_FOLLOWING_TIMEOUT_MS: Final = 100
 """Maximum time for which a following error may exceed its window before the drive reacts [ms]."""
 
@@ -133,7 +135,8 @@ async def configure_reactions(drive: Differences, drives: Drives, units: Units) 
         drive.add_note(f"{title((0x6007, 0))} accepts neither 3 nor 1: without this service, the drive coasts")
     await drive.ensure(0x605A, 0, 2)  # quick stop: follow the ramp 6085h, then remove power
     # 605Eh = 2: after a fault, the drive follows the quick-stop ramp. Another ramp (1) or coasting (0) is accepted.
-    await drive.ensure(0x605E, 0, 2, also=(1, 0))
+    if await drive.ensure(0x605E, 0, 2, also=(1, 0)) == DISABLE_DRIVE_OPTION:
+        drive.add_note(f"{title((0x605E, 0))} accepts neither 2 nor 1: after a fault, the drive coasts")
     if await drive.remote.has(0x6085):
         ramp = units.acceleration(name, "quick_stop_deceleration", drives.quick_stop_deceleration)
         await drive.ensure(0x6085, 0, ramp)
@@ -144,8 +147,10 @@ async def configure_reactions(drive: Differences, drives: Drives, units: Units) 
 
 
 async def configure_homing(drive: Differences, homing: Homing, units: Units) -> None:
-    """Configure the drive's homing: 6098h, 6099h, 609Ah, 607Ch."""
+    """Configure the drive's homing: 605Dh, 6098h, 6099h, 609Ah, 607Ch."""
     name = drive.remote.name
+    # 605Dh = 1: halt, which stops a homing, follows a ramp. With the values 2 to 4 the drive brakes too; 0 coasts.
+    await drive.ensure(0x605D, 0, 1, also=(2, 3, 4))
     await drive.ensure(0x6098, 0, homing.method)
     await drive.ensure(0x6099, 1, units.speed(name, "homing.speed_switch", homing.speed_switch))
     await drive.ensure(0x6099, 2, units.speed(name, "homing.speed_zero", homing.speed_zero))
