@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from drivers.foreign_process import COUNTS
-from drivers.test_foreign import MAKES, Rig
+from drivers.test_foreign import IN_COUNTS, MAKES, Rig
 from rigs import Closing, alike
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402.drives import Cia402
@@ -51,6 +51,20 @@ def test_drives_that_restart_are_configured_again(closing: Closing, name: str, s
     assert rig.feedback.fault is None, rig.feedback.fault
     rig.enable()
     rig.go(0.05, 50)
+
+
+def test_a_drive_that_lost_a_unit_that_the_set_up_gave_it_gets_it_again(closing: Closing) -> None:
+    rig = closing(Rig("maxon_epos4_compact50_5", None, IN_COUNTS, revolutions_per_metre=None))
+    rig.ready()
+    rig.nodes[0].boot()
+    rig.feedback = rig.cycle(rig.feedback.position)
+    assert rig.nodes[0].value(0x60A9) == 0x00B4_4700
+    for _ in range(ENDS):
+        rig.feedback = rig.cycle(rig.feedback.position)
+        if rig.feedback.unready == (None, None, None):
+            break
+    assert rig.feedback.unready == (None, None, None)
+    assert rig.nodes[0].value(0x60A9) == 0x00B5_0300
 
 
 class KilledDrives:

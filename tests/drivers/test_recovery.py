@@ -248,6 +248,60 @@ def test_a_drive_in_the_place_of_another_is_refused_by_name(rig: RecoveryRig) ->
     rig.recover()
 
 
+SCALING: dict[tuple[int, int], tuple[int, int, int, str]] = {
+    (0x607E, 0): (8, 0xC0, 0, "polarity) is 00h, was C0h"),
+    (0x6080, 0): (32, 5000, 1000, "max motor speed) is 1000, was 5000"),
+    (0x608F, 1): (32, 4096, 1, "position encoder resolution) is 1, was 4096"),
+    (0x6091, 1): (32, 10, 1, "gear ratio) is 1, was 10"),
+    (0x6092, 2): (32, 2, 1, "feed constant) is 1, was 2"),
+    (0x6097, 1): (32, 10, 1, "acceleration factor) is 1, was 10"),
+    (0x60A8, 0): (32, 0x00AC_0000, 0x00B5_0000, "position unit) is 00B50000h, was 00AC0000h"),
+    (0x60A9, 0): (32, 0xFFB5_0300, 0x00B5_0300, "velocity unit) is 00B50300h, was FFB50300h"),
+    (0x60AA, 0): (32, 0xFFB5_5700, 0x00B5_5700, "acceleration unit) is 00B55700h, was FFB55700h"),
+}
+"""Length of an object, its value before the supply is lost and after, and what is said of it."""
+
+
+@pytest.mark.parametrize("key", SCALING, ids=lambda key: f"{key[0]:04X}:{key[1]}")
+def test_a_drive_that_lost_its_direction_or_scale_is_refused_until_it_is_as_it_was(
+    rig: RecoveryRig, key: tuple[int, int]
+) -> None:
+    """Such as parameters that the manufacturer's tool has written but not saved: the drive would move otherwise."""
+    bits, before, after, said = SCALING[key]
+    drive = rig.drives[1]
+    for other in {key, (key[0], 1), (key[0], 2)} if key[1] else {key}:
+        drive.objects.add(*other, bits, signed=False)
+        drive.objects[other].value = drive.objects[other].default = 2
+    drive.objects[key].value = drive.objects[key].default = before
+    rig.driver.configure(rig.config.period)  # the first set-up of a service
+    holding(rig)
+    rig.cut(1)
+    drive.objects[key].default = after
+    rig.cycles(20)
+    rig.supply(1)
+    rig.until(lambda: bool(rig.said("the drive has lost its settings")), ENDS)
+    answer = rig.command("reset")
+    assert isinstance(answer, Refused)
+    assert f"drive B: the drive has lost its settings: object {key[0]:04X}:{key[1]:02X} ({said}; " in answer.message
+    assert "save them in the drive, or restart the service" in answer.message
+    rig.cycles(round(1.1 * RETRY_AFTER / rig.config.period))
+    assert rig.mode is Mode.FAULT
+    assert not rig.ready()
+    drive.objects[key].value = before
+    rig.recover()
+
+
+def test_a_replaced_drive_with_other_settings_is_said_to_be_replaced(rig: RecoveryRig) -> None:
+    holding(rig)
+    rig.cut(2)
+    rig.cycles(20)
+    rig.supply(2)
+    rig.drives[2].objects[0x1018, 4].value += 1
+    rig.drives[2].objects[0x60A8, 0].value = 0x00AC_0000
+    rig.until(lambda: bool(rig.said("the drive has been replaced: serial number")), ENDS)
+    assert not rig.said("lost its settings")
+
+
 SETTINGS = (*range(0x1005, 0x1018), *range(0x1400, 0x1C00), 0x605A, 0x6065, 0x6085)
 """Objects that set-up writes, but for the mode; a restart loses them."""
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from trirail_drivers.cia402.differences import Differences
-from trirail_drivers.cia402.sdo import Remote, SdoRefused
+from trirail_drivers.cia402.objects import Key
+from trirail_drivers.cia402.sdo import Remote, SdoRefused, shown
 from trirail_drivers.cia402.units import (
     Unit,
     UnitBase,
@@ -30,6 +31,34 @@ _KEYS: Final = {0x60A9: "velocity_unit", 0x60AA: "acceleration_unit"}
 _POLARITIES: Final = 0xC0
 """Bits of 607Eh that reverse positions and velocities."""
 _FACTORS: Final = {0x60A9: 0x6096, 0x60AA: 0x6097}
+_SCALING: Final = {
+    0x607E: "polarity",
+    0x6080: "max motor speed",
+    0x6089: "position notation index",
+    0x608A: "position dimension index",
+    0x608B: "velocity notation index",
+    0x608C: "velocity dimension index",
+    0x608D: "acceleration notation index",
+    0x608E: "acceleration dimension index",
+    0x608F: "position encoder resolution",
+    0x6090: "velocity encoder resolution",
+    0x6091: "gear ratio",
+    0x6092: "feed constant",
+    0x6093: "position factor",
+    0x6094: "velocity encoder factor",
+    0x6095: "velocity factor 1",
+    0x6096: "velocity factor",
+    0x6097: "acceleration factor",
+    0x60A8: "position unit",
+    0x60A9: "velocity unit",
+    0x60AA: "acceleration unit",
+}
+"""Objects that determine the direction, the scale and the units of a drive (CiA 402-2, and its first edition)."""
+_RATIOS: Final = range(0x608F, 0x6098)
+"""Those of these objects that are a numerator, subindex 1, and a divisor, subindex 2."""
+
+Scaling = Mapping[Key, int | None]
+"""Values of the objects that determine the direction, the scale and the units of a drive; None for a missing one."""
 
 
 async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
@@ -49,6 +78,41 @@ async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
         velocity.name if velocity else "",
         acceleration.name if acceleration else "",
     )
+
+
+async def read_scaling(remote: Remote) -> Scaling:
+    """Return the values of the objects that determine the direction, the scale and the units of a drive."""
+    values: dict[Key, int | None] = {}
+    for index in _SCALING:
+        for subindex in (1, 2) if index in _RATIOS else (0,):
+            if subindex != 2 or await remote.has(index, 1):
+                values[index, subindex] = await remote.peek(index, subindex)
+    return values
+
+
+def lost_settings(name: str, before: Scaling, now: Scaling) -> str:
+    """Return the error message for a drive whose scaling was different `before`, or "".
+
+    A unit in counts that the set-up itself has written may differ, since the set-up writes it again.
+    """
+    differing = [
+        f"object {key[0]:04X}:{key[1]:02X} ({_SCALING[key[0]]}) is {_text(key, now.get(key))}, "
+        f"was {_text(key, before.get(key))}"
+        for key in {**before, **now}
+        if now.get(key) != before.get(key) and before.get(key) != _IN_COUNTS.get(key[0], math.nan)
+    ]
+    if not differing:
+        return ""
+    return (
+        f"drive {name}: the drive has lost its settings: {', '.join(differing)}; restore them and save them in the "
+        "drive, or restart the service to accept the change"
+    )
+
+
+def _text(key: Key, value: int | None) -> str:
+    if value is None:
+        return "missing"
+    return f"{value & 0xFF:02X}h" if key[0] == 0x607E else shown(*key, value)
 
 
 async def check_polarity(remote: Remote) -> None:

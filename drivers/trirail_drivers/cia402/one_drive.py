@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Difference, Differences
 from trirail_drivers.cia402.digital_io import check_inputs, configure_outputs
-from trirail_drivers.cia402.drive_units import check_polarity, read_units
+from trirail_drivers.cia402.drive_units import Scaling, check_polarity, read_scaling, read_units
 from trirail_drivers.cia402.dry_run import DryRun
 from trirail_drivers.cia402.guarding import configure_watchdogs
 from trirail_drivers.cia402.makers_objects import write_makers_objects
@@ -74,6 +76,8 @@ class SetUp(NamedTuple):
     """Error message if the drive lacks protections that it must have, or ""."""
     home_offset: int | None = None
     """Home offset 607Ch, the zero of the drive's positions."""
+    scaling: Scaling = MappingProxyType({})
+    """Direction, scale and units of the drive."""
 
 
 class Start(NamedTuple):
@@ -107,6 +111,8 @@ class SetupTask(NamedTuple):
     io: DigitalIo = NO_IO[0]
     velocity_offset: bool = True
     """Whether the setpoints contain the velocity offset if the drive has it."""
+    check: Callable[[Identity, Scaling], None] | None = None
+    """Function that raises DriveError for a returning drive that is not as it was."""
 
 
 async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
@@ -128,6 +134,9 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
     differences = Differences(remote)
     modes = await choose_modes(remote, homes=drive.homing is not None)
     await write_makers_objects(differences, drive.write)
+    identity = await _read_identity(remote)
+    if one.check is not None:
+        one.check(identity, await read_scaling(remote))
     units = await read_units(differences, drive, one.scale)
     await configure_cycle_period(differences, one.period)
     watched = await configure_watchdogs(differences, drives, heartbeat_period_ms(drives), drive.node)
@@ -168,9 +177,6 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
         unused_rpdos,
         unused_tpdos,
     )
-    vendor, product, revision, serial = [await remote.peek(0x1018, subindex) for subindex in range(1, 5)]
-    device_type = await remote.peek(0x1000) or 0
-    identity = Identity(device_type, vendor, product, revision, serial, await remote.peek(0x6502))
     refused = differences.refusal(drive.accept_without)
     return SetUp(
         remote.name,
@@ -183,7 +189,14 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
         tuple(differences.missing_protections),
         refused,
         await remote.peek(0x607C),
+        await read_scaling(remote),
     )
+
+
+async def _read_identity(remote: Remote) -> Identity:
+    vendor, product, revision, serial = [await remote.peek(0x1018, subindex) for subindex in range(1, 5)]
+    device_type = await remote.peek(0x1000) or 0
+    return Identity(device_type, vendor, product, revision, serial, await remote.peek(0x6502))
 
 
 async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool) -> None:

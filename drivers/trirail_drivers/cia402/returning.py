@@ -7,8 +7,9 @@ from typing import Any, Final
 
 from trirail_drivers.bus.frames import FrameSender
 from trirail_drivers.cia402.axis import Cia402Axis
+from trirail_drivers.cia402.drive_units import Scaling, lost_settings
 from trirail_drivers.cia402.duplicate_node import ANSWERS_AFTER
-from trirail_drivers.cia402.one_drive import HAS_POWER, SetUp, SetupTask, Start
+from trirail_drivers.cia402.one_drive import HAS_POWER, Identity, SetUp, SetupTask, Start
 from trirail_drivers.cia402.sdo import Remote
 from trirail_drivers.cia402.sdo_client import Client
 from trirail_drivers.cia402.setup import check_identifiers, configure_one
@@ -53,7 +54,8 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         client = Client(sender, before.node, before.od, before.timeout, clock)
         remote = Remote(self.axis.name, client)
         remote.logs = False
-        return configure_one(self.one._replace(remote=remote), self._fastest, self._check), client
+        one = self.one._replace(remote=remote, check=self._check_same)
+        return configure_one(one, self._fastest, self._check_identifiers), client
 
     def record_setup(self, made: SetUp, answered: int) -> None:
         """Record a complete set-up. The home offset stays that of the first one, with which positions are compared."""
@@ -98,13 +100,17 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         """
         return not self.axis.unanswered or now >= self.axis.answered_by
 
-    def _check(self, looked: SetUp) -> None:
-        """Raise DriveError if the drive is not the previous one, or has a PDO identifier that another drive uses."""
-        name, allowed = self.axis.name, self.one.drive.allow_replacement
-        if self.setup is not None:
-            before, now = self.setup.identity, looked.identity
-            numbers = {words: (getattr(before, field), getattr(now, field)) for field, words in _NUMBERS.items()}
-            may_differ = [_NUMBERS[field] for field in _MAY_DIFFER]
-            if text := replacement_refusal(name, numbers, may_differ, allowed=allowed):
-                raise DriveError(text)
-        check_identifiers([*(made for made in self._setups() if made.name != name), looked])
+    def _check_same(self, now: Identity, scaling: Scaling) -> None:
+        """Raise DriveError if the drive is not the previous one, or would move in another direction or scale."""
+        if self.setup is None:
+            return
+        name, allowed, before = self.axis.name, self.one.drive.allow_replacement, self.setup.identity
+        numbers = {words: (getattr(before, field), getattr(now, field)) for field, words in _NUMBERS.items()}
+        may_differ = [_NUMBERS[field] for field in _MAY_DIFFER]
+        replaced = replacement_refusal(name, numbers, may_differ, allowed=allowed)
+        if text := replaced or lost_settings(name, self.setup.scaling, scaling):
+            raise DriveError(text)
+
+    def _check_identifiers(self, looked: SetUp) -> None:
+        """Raise DriveError if the drive has a PDO identifier that another drive uses."""
+        check_identifiers([*(made for made in self._setups() if made.name != self.axis.name), looked])

@@ -55,7 +55,9 @@ def configure(
 
 
 async def configure_one(one: SetupTask, fastest: float | None, check: Callable[[SetUp], None]) -> tuple[SetUp, Start]:
-    """Set up one drive as `configure` does. After the dry run, `check` is called, which raises for a wrong drive."""
+    """Set up one drive as `configure` does. After the dry run, `check` is called, which raises if the
+    drive cannot share the bus.
+    """
     bus, node = one.remote.client.bus, one.drive.node
     send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
     looked = await rehearse_setup(one)
