@@ -22,7 +22,16 @@ from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import Notice
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Disturbance, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Mode, SetOutput
-from trirail_drivers.interface import Counts, DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
+from trirail_drivers.interface import (
+    Counts,
+    DriveFault,
+    DriveGroup,
+    Feedback,
+    MissingProtection,
+    PowerState,
+    Travel,
+    Triple,
+)
 
 SHIPPED = load(SIM)
 # In simulated time no machine keeps the drives waiting: what is lost is lost as soon as that of real ones.
@@ -68,7 +77,9 @@ class PerfectDrives:
         """Take output words."""
         self.outputs = list(words)
 
-    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
+    def configure(
+        self, period: float, fastest: float | None = None, *, travel: Travel | None = None, awaits: bool = False
+    ) -> None:
         """Do nothing: there is nothing to set up."""
 
     def sync(self) -> None:

@@ -12,6 +12,8 @@ NAMES = ("A", "B", "C")
 """Names of the drives, which are also the names of their sliders."""
 
 Triple = tuple[float, float, float]
+Travel = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+"""Lower and upper end of the travel of the sliders A, B, C [m]."""
 
 Clock = Callable[[], float]
 """Function that returns the monotonic or simulated time [s]."""
@@ -172,7 +174,9 @@ class DriveGroup(Protocol):
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
         """For each drive, the first fault that it has reported itself since the last reset, or None."""
 
-    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
+    def configure(
+        self, period: float, fastest: float | None = None, *, travel: Travel | None = None, awaits: bool = False
+    ) -> None:
         """Set up the drives for a cycle of `period` seconds, verify the settings, and start the drives without power.
 
         Settings that a drive can report are read back.
@@ -183,6 +187,8 @@ class DriveGroup(Protocol):
             Cycle period [s].
         fastest
             Velocity limit of the sliders [m/s]. If it is given, drives that cannot handle it are refused.
+        travel
+            Travel of each slider [m]. If it is given, drives whose own position limits exclude part of it are refused.
         awaits
             If True, a drive that does not answer causes a fault and not a DriveError. Once the drive appears, the
             following cycles configure it like a drive that has restarted.

@@ -13,7 +13,8 @@ import pytest
 from trirail.cli import drives_command
 from trirail.cli.app import app
 from trirail.cli.drives_command import UNTESTED_NOTE
-from trirail.config import SIM
+from trirail.config import SIM, load
+from trirail.processes.loop_process import rehearse
 from trirail_drivers import files
 from trirail_drivers.cia402 import parameter_file
 from trirail_drivers.cia402.backup import RestoreResult, UnrestoredParameter
@@ -51,6 +52,29 @@ def test_differences_are_written_when_that_is_asked_for(capsys: pytest.CaptureFi
     assert "written: 1017:00 Producer heartbeat time: 0 -> 100, for monitoring by this service" in words
 
 
+def narrow(path: Path) -> Path:
+    """Write the configuration of a robot whose drive B has software limits that are narrower than its travel."""
+    limit = '[[drives.B.write]]\nobject = 0x607D\nsub = {}\nvalue = {}\ntype = "i32"\nwhy = "…"\n'
+    path.write_text(SIM.read_text() + "\n" + limit.format(1, -20_000) + limit.format(2, 20_000))
+    return path
+
+
+def test_a_drive_whose_limits_exclude_some_of_the_travel_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = str(narrow(tmp_path / "robot.toml"))
+    assert run("drives", path) == 1
+    said = "drive B: object 607D (software position limit) is -20000 to 20000 counts, but limits.slider.position"
+    assert said in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(DriveError, match=re.escape(said)):
+        run("drives", path, "--apply")
+
+
+def test_stops_of_a_robot_whose_drive_has_such_limits_are_not_rehearsed(tmp_path: Path) -> None:
+    (lacking,) = rehearse(load(narrow(tmp_path / "robot.toml")))
+    assert "drive B: object 607D" in lacking
+
+
 @pytest.mark.parametrize("simulated", [True, False])
 def test_of_real_drives_it_is_said_that_no_make_was_tried(
     simulated: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -73,10 +97,10 @@ def test_drives_that_tell_nothing(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("drives", "save", str(tmp_path)) == 0
-    assert "drive C, node 3: 80 parameters in" in capsys.readouterr().out
+    assert "drive C, node 3: 81 parameters in" in capsys.readouterr().out
     a, b = (tmp_path / f"drive-{name}.dcf" for name in "AB")
     assert run("drives", "compare", str(a)) == 0
-    assert "0 of 80 parameters differ" in capsys.readouterr().out
+    assert "0 of 81 parameters differ" in capsys.readouterr().out
     head, section, rest = a.read_text().partition("[607C]")
     a.write_text(head + section + rest.replace("ParameterValue=0", "ParameterValue=77", 1))
     assert run("drives", "compare", str(a), "--json") == 1

@@ -731,11 +731,11 @@ def test_a_report_that_cannot_be_saved_hides_no_judgement(
 def allow_one_setup(monkeypatch: pytest.MonkeyPatch) -> None:
     configure, configured = Cia402.configure, list[Cia402]()
 
-    def configure_once(self: Cia402, *args: float) -> None:
+    def configure_once(self: Cia402, *args: float, **keys: object) -> None:
         if configured:
             raise DriveError("drive C: does not answer")
         configured.append(self)
-        configure(self, *args)
+        configure(self, *args, **keys)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Cia402, "configure", configure_once)
 

@@ -470,3 +470,89 @@ def test_drives_are_not_read_beside_another_master(identifier: int, apply: bool)
         with pytest.raises(DriveError, match="another master is on the bus"):
             inspection.inspect(line.bus, line.drives, 0.001, line.clock, 0.2, apply=apply)
         assert not line.bus.sent  # type: ignore[attr-defined]
+
+
+TRAVEL = (-0.02, 0.05)
+"""Travel of drive A [m]; with 1e6 counts per metre and the direction -1, -50 000 to 20 000 counts."""
+LIMITS = [
+    (0x607B, 0, 0, ""),
+    (0x607B, -50_000, 20_000, ""),
+    (0x607B, -49_999, 20_000, "refused"),
+    (0x607B, -50_000, 19_999, "refused"),
+    (0x607B, 20_000, 20_000, "noted"),
+    (0x607B, 20_000, -50_000, "noted"),
+    (0x607B, -(2**31), 2**31 - 1, ""),
+    (0x607D, 0, 0, ""),
+    (0x607D, -50_000, 20_000, ""),
+    (0x607D, -49_999, 20_000, "refused"),
+    (0x607D, -50_000, 19_999, "refused"),
+    (0x607D, 0, 20_000, "refused"),
+    (0x607D, 1, -1, ""),
+    (0x607D, 5, 5, "noted"),
+    (0x607D, -(2**31), 2**31 - 1, ""),
+]
+"""Ends of a position limit, and what becomes of a drive with it."""
+
+
+def limited(line: Line, limits: dict[int, tuple[int, int]], *, apply: bool, home_offset: int = 0) -> dict[str, Any]:
+    """What the set-up of drive A finds if the drive has position limits."""
+    line.drives = replace(line.drives, A=replace(line.drives.A, direction=-1))
+    line.objects[0x607C, 0].value = home_offset
+    for index, ends in limits.items():
+        for subindex, end in enumerate(ends, 1):
+            line.objects.add(index, subindex, 32, signed=True)
+            line.objects[index, subindex].value = end
+    travel = (TRAVEL, (-1.0, 1.0), (-1.0, 1.0))
+    try:
+        return {"notes": []} | inspection.inspect(line.bus, line.drives, 0.001, line.clock, apply=apply, travel=travel)[
+            0
+        ]
+    except DriveError as error:
+        return {"refused": str(error), "notes": []}
+
+
+@pytest.mark.parametrize("apply", [False, True])
+@pytest.mark.parametrize(("index", "least", "most", "end"), LIMITS)
+def test_a_position_limit_of_a_drive_must_contain_the_travel(
+    index: int, least: int, most: int, end: str, apply: bool
+) -> None:
+    with Line(SERVO) as line:
+        found = limited(line, {index: (least, most)}, apply=apply)
+    said = f"object {index:04X} ({'position range' if index == 0x607B else 'software position'} limit) is {least} to "
+    assert [said in found["refused"], [said in each for each in found["notes"]]] == [
+        end == "refused",
+        [True] * (end == "noted"),
+    ]
+    if end == "refused":
+        assert (
+            f"{most} counts, but limits.slider.position = [-0.02, 0.05] is -50000 to 20000 counts" in found["refused"]
+        )
+    else:
+        assert not found["refused"]
+
+
+@pytest.mark.parametrize("homing", [False, True])
+@pytest.mark.parametrize(
+    ("offset", "least", "most", "end"),
+    [
+        (3_000, -47_000, 23_000, "noted"),  # shifted by the offset, as in the standard, it contains the travel
+        (3_000, -50_000, 20_000, "noted"),
+        (3_000, -50_000, 23_000, ""),
+        (3_000, -40_000, 23_000, "refused"),
+    ],
+)
+def test_a_software_limit_may_count_from_the_home(homing: bool, offset: int, least: int, most: int, end: str) -> None:
+    """The set-up of a drive with homing makes the home offset zero."""
+    with Line(SERVO) as line:
+        if homing:
+            line.drives = replace(line.drives, A=replace(line.drives.A, homing=HOMING))
+        found = limited(line, {0x607D: (least, most)}, apply=True, home_offset=offset)
+    notes = [each for each in found["notes"] if "607C, 3000, does not matter" in each]
+    if homing:
+        end = "" if least <= -50_000 and most >= 20_000 else "refused"
+    assert ["607D" in found["refused"], len(notes)] == [end == "refused", end == "noted"]
+
+
+def test_a_drive_without_position_limits_or_with_half_a_limit_is_accepted() -> None:
+    with Line(SERVO) as line:
+        assert not limited(line, {0x607B: (5,), 0x607D: (5,)}, apply=True)["refused"]  # type: ignore[dict-item]

@@ -133,6 +133,28 @@ def test_a_drive_moves_as_fast_as_it_is_told(closing: Closing, name: str) -> Non
     assert rig.feedback.position == pytest.approx([node.servo.position for node in rig.nodes], abs=2e-3)
 
 
+@pytest.mark.parametrize("name", MAKES)
+def test_position_limits_of_a_drive_as_it_is_delivered_are_no_reason_to_refuse_it(closing: Closing, name: str) -> None:
+    rig = closing(Rig(name))
+    rig.drives.configure(PERIOD, 0.2, travel=((-1.0, 1.0), (-0.5, 0.2), (0.1, 0.3)))
+    rig.feedback = rig.cycle()
+    assert not [warning for warning in rig.warnings if "607" in warning]
+
+
+def test_a_drive_that_returns_with_limits_that_exclude_some_of_the_travel_is_not_ready(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold"))
+    rig.drives.configure(PERIOD, 0.2, travel=((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0)))
+    rig.feedback = rig.cycle()
+    node = rig.nodes[1]
+    node.boot()
+    node.put(0x607B, 100_000, 2)
+    for _ in range(2000):
+        rig.feedback = rig.cycle(rig.feedback.position)
+        if "607B" in str(rig.feedback.unready[1]):
+            break
+    assert "drive B: object 607B (position range limit) is -1000000000 to 100000 counts" in str(rig.feedback.unready[1])
+
+
 ACTIONS = {0x6040, 0x60C4}
 """What is written in any case: a controlword that takes power off, and what empties the buffer of mode 7."""
 

@@ -40,7 +40,7 @@ from trirail_drivers.driver.row_updates import (
     scale_setpoint,
 )
 from trirail_drivers.errors import BusError
-from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
+from trirail_drivers.interface import Clock, Feedback, PowerState, Travel, Triple
 from trirail_drivers.timing import BusTiming
 
 REPEAT_AFTER = 3
@@ -81,7 +81,9 @@ class Cia402(Driver[Cia402Axis]):
         self._expected_state: list[tuple[int, int]] = []
         """Statusword and inputs of each drive for which the expected frames were last written."""
 
-    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
+    def configure(
+        self, period: float, fastest: float | None = None, *, travel: Travel | None = None, awaits: bool = False
+    ) -> None:
         """Set up the drives for a cycle of `period` seconds, read every value back, and start the drives without power.
 
         With `awaits`, a drive that does not answer causes a fault and is configured when it appears, and a missing bus
@@ -89,8 +91,8 @@ class Cia402(Driver[Cia402Axis]):
 
         Raises BusError if the cycle's frames do not fit on the bus, DriveTimeout or ConfigurationRefused if a drive
         does not answer or does not accept a value, and DriveError if a drive's unit of velocity does not fit `fastest`,
-        the velocity limit of the sliders [m/s]. A drive in fault causes no error: the feedback reports the fault, and
-        `reset` clears it.
+        the velocity limit of the sliders [m/s], or if its position limits exclude part of their `travel` [m]. A drive
+        in fault causes no error: the feedback reports the fault, and `reset` clears it.
         """
         io = [axis.io for axis in self._axes]
         plan = process_data.plan_traffic(self._drives, io, 1.0 / period, self._timing)
@@ -101,7 +103,14 @@ class Cia402(Driver[Cia402Axis]):
             axis.status_within = max(STATUS_WITHIN, self._drives.missed_positions * period)
         scales = tuple(axis.scale for axis in self._axes)
         ones = setup.setup_tasks(
-            self._wire.bus, self._drives, scales, period, self._clock, io, velocity_offset=plan.velocity_offset
+            self._wire.bus,
+            self._drives,
+            scales,
+            period,
+            self._clock,
+            io,
+            velocity_offset=plan.velocity_offset,
+            travel=travel,
         )
         configure = partial(setup.configure, self._wire.bus, self._drives, ones, fastest, awaits=awaits)
         done, lost = self._set_up(configure, awaits=awaits)

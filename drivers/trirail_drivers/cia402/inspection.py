@@ -15,7 +15,7 @@ from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
-from trirail_drivers.interface import NAMES, Clock
+from trirail_drivers.interface import NAMES, Clock, Travel
 from trirail_drivers.timing import DEFAULT_TIMING, BusTiming
 
 
@@ -29,11 +29,13 @@ def inspect(
     apply: bool,
     io: Sequence[DigitalIo] = NO_IO,
     timing: BusTiming = DEFAULT_TIMING,
+    travel: Travel | None = None,
 ) -> list[dict[str, Any]]:
     """Return a description of each drive, with the differences between its values and those that the cycle needs.
 
     `fastest` is the velocity limit of the sliders [m/s], which must fit the drives' units; `io` contains the digital
-    outputs and inputs of each drive, and `timing` contains the bit rates of the bus. "bus_load" is the worst-case load
+    outputs and inputs of each drive, `timing` contains the bit rates of the bus, and `travel` [m] is that of each
+    slider, which the drives' position limits must contain. "bus_load" is the worst-case load
     of the bus with the PDOs that the drives can map, or None unless all three drives were read.
 
     With `apply`, the required values are written to all three drives or, if one of them is refused, to none. The drives
@@ -43,7 +45,7 @@ def inspect(
     """
     # A drive may send SYNC until its set-up: 1005h bit 30 is one of the values that are corrected.
     with exclusive_bus(bus, drives, clock, allow_sync=True) as watched:
-        return _inspect(watched, drives, period, clock, fastest, apply=apply, io=io, timing=timing)
+        return _inspect(watched, drives, period, clock, fastest, apply=apply, io=io, timing=timing, travel=travel)
 
 
 def _inspect(
@@ -56,20 +58,21 @@ def _inspect(
     apply: bool,
     io: Sequence[DigitalIo],
     timing: BusTiming,
+    travel: Travel | None,
 ) -> list[dict[str, Any]]:
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
     offset = process_data.plan_traffic(drives, io, 1.0 / period, timing).velocity_offset
     if apply:
-        results = _inspect(bus, drives, period, clock, fastest, apply=False, io=io, timing=timing)
+        results = _inspect(bus, drives, period, clock, fastest, apply=False, io=io, timing=timing, travel=travel)
         refused = dict.fromkeys(each["refused"] for each in results if each["refused"])
         raise_combined([DriveError(text) for text in refused])
-        tasks = setup.setup_tasks(bus, drives, scales, period, clock, io, velocity_offset=offset)
+        tasks = setup.setup_tasks(bus, drives, scales, period, clock, io, velocity_offset=offset, travel=travel)
         made = [result[0] for result in setup.configure(bus, drives, tasks, fastest) if result is not None]
         for drive in drives.each:
             bus.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node).message())
         load = _bus_load(made, drives, period, timing)
         return [_as_json(each, load) for each in made]
-    ends = setup.survey(bus, drives, scales, period, clock, fastest, io, velocity_offset=offset)
+    ends = setup.survey(bus, drives, scales, period, clock, fastest, io, velocity_offset=offset, travel=travel)
     looked = [end for end in ends if not isinstance(end, DriveError)]
     load = _bus_load(looked, drives, period, timing)
     results = [

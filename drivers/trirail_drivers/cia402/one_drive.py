@@ -20,6 +20,7 @@ from trirail_drivers.cia402.pdos import Pdos
 from trirail_drivers.cia402.process_data import Exchange
 from trirail_drivers.cia402.sdo import Remote, RestartedError, SdoRefused
 from trirail_drivers.cia402.settings import (
+    check_position_limits,
     configure_cycle_period,
     configure_homing,
     configure_reactions,
@@ -111,6 +112,8 @@ class SetupTask(NamedTuple):
     io: DigitalIo = NO_IO[0]
     velocity_offset: bool = True
     """Whether the setpoints contain the velocity offset if the drive has it."""
+    travel: tuple[float, float] | None = None
+    """Travel of the slider [m]; None if the drive's position limits are not checked."""
     check: Callable[[Identity, Scaling], None] | None = None
     """Function that raises DriveError for a returning drive that is not as it was."""
 
@@ -144,6 +147,8 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
     mode, shown = await configure_mode(differences, modes)
     if drive.homing is not None:
         await configure_homing(differences, drive.homing, units)
+    if one.travel is not None:
+        await check_position_limits(differences, one.scale, one.travel)
     kept = await configure_outputs(differences, one.io)
     if one.io.inputs:
         await check_inputs(differences)

@@ -11,6 +11,7 @@ from trirail_drivers.cia402.objects import Key, title
 from trirail_drivers.cia402.sdo import SdoRefused, same
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives, Homing
+from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import ConfigurationRefused, DriveError
 from trirail_drivers.interface import NAMES
 
@@ -159,3 +160,41 @@ async def configure_homing(drive: Differences, homing: Homing, units: Units) -> 
     else:
         drive.lack((0x609A, 0), "it has no such object")
     await drive.ensure(0x607C, 0, 0)  # manufacturers use different signs; `offset` in [drives] is used instead
+
+
+_POSITION_LIMITS: Final = {
+    0x607B: ("position range limit", "targets outside it wrap to its other end"),
+    0x607D: ("software position limit", "the drive moves to no target outside it"),
+}
+"""Name of each position limit, whose subindexes 1 and 2 are its ends, and its effect (CiA 402-2)."""
+
+
+async def check_position_limits(drive: Differences, scale: Scale, travel: tuple[float, float]) -> None:
+    """Raise DriveError if a position limit of the drive excludes part of the `travel` of its slider [m].
+
+    The positions of a drive with homing count from its home, as the limits do. Two zeros are no limit, nor is a
+    software limit whose ends are exchanged. CiA 402-2 shifts the software limit by the home offset, but not every drive
+    does so: if this decides, a note is added.
+    """
+    remote = drive.remote
+    low, high = sorted(scale.counts(end) for end in travel)
+    for index, (called, effect) in _POSITION_LIMITS.items():
+        least, most = await remote.peek(index, 1), await remote.peek(index, 2)
+        if least is None or most is None or least == most == 0 or (index == 0x607D and least > most):
+            continue
+        limit = f"object {index:04X} ({called}) is {least} to {most} counts"
+        if least >= most:
+            drive.add_note(f"{limit}, an empty range; make sure that it means no limit")
+            continue
+        shift = (await remote.peek(0x607C) or 0) if index == 0x607D else 0
+        excludes = [low < least - by or most - by < high for by in (0, shift)]
+        if not any(excludes):
+            continue
+        text = f"{limit}, but limits.slider.position = [{travel[0]:g}, {travel[1]:g}] is {low} to {high} counts"
+        if not all(excludes):
+            drive.add_note(f"{text}; make sure that the home offset 607C, {shift}, does not matter")
+            continue
+        raise DriveError(
+            f"drive {remote.name}: {text}: {effect}; widen it with the manufacturer's tool or "
+            f"[[drives.{remote.name}.write]], or reduce limits.slider.position"
+        )

@@ -17,7 +17,7 @@ from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveAbsentError, DriveError
-from trirail_drivers.interface import NAMES, Clock
+from trirail_drivers.interface import NAMES, Clock, Travel
 
 
 def configure(
@@ -81,12 +81,13 @@ def survey(
     io: Sequence[DigitalIo] = NO_IO,
     *,
     velocity_offset: bool = True,
+    travel: Travel | None = None,
 ) -> list[SetUp | DriveError]:
     """Read the identity of each drive and find the values that its set-up would change.
 
     Nothing is written, and no state of a drive is changed.
     """
-    each = _drives(bus, drives, scales, period, clock, io, velocity_offset=velocity_offset)
+    each = _drives(bus, drives, scales, period, clock, io, velocity_offset=velocity_offset, travel=travel)
     conversations = [rehearse_setup(one, read_only=True) for one in each]
     ends = run_setups(bus, clock, [one.remote for one in each], "reading", conversations)
     return [end if isinstance(end, DriveError) else _velocity_refused(end, fastest) or end for end in ends]
@@ -101,16 +102,17 @@ def setup_tasks(
     io: Sequence[DigitalIo] = NO_IO,
     *,
     velocity_offset: bool = True,
+    travel: Travel | None = None,
 ) -> list[SetupTask]:
-    """Return the set-up tasks of the three drives, given the cycle period [s], the drives' digital I/O, and whether the
-    setpoints contain the velocity offset.
+    """Return the set-up tasks of the three drives, given the cycle period [s], the drives' digital I/O, whether the
+    setpoints contain the velocity offset, and the `travel` of each slider [m].
 
     Raises DriveError for settings that no drive can accept.
     """
     check_nodes(drives)
     heartbeat_period_ms(drives)
     interpolation_periods(period)
-    return _drives(bus, drives, scales, period, clock, io, velocity_offset=velocity_offset)
+    return _drives(bus, drives, scales, period, clock, io, velocity_offset=velocity_offset, travel=travel)
 
 
 def _drives(
@@ -122,12 +124,13 @@ def _drives(
     io: Sequence[DigitalIo],
     *,
     velocity_offset: bool,
+    travel: Travel | None,
 ) -> list[SetupTask]:
     asked = remotes(bus, drives, clock)
-    each = zip(asked, drives.each, scales, io, strict=True)
+    each = zip(asked, drives.each, scales, io, travel or (None, None, None), strict=True)
     return [
-        SetupTask(remote, drive, drives, scale, period, digital, velocity_offset)
-        for remote, drive, scale, digital in each
+        SetupTask(remote, drive, drives, scale, period, digital, velocity_offset, own)
+        for remote, drive, scale, digital, own in each
     ]
 
 

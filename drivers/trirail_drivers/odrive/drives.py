@@ -25,7 +25,7 @@ from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.driver.row_updates import count_sync, due_setpoint, end_reading
-from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
+from trirail_drivers.interface import Clock, DriveFault, Feedback, Travel, Triple
 from trirail_drivers.odrive import cansimple, setup
 from trirail_drivers.odrive.axis import RESET_TIME, OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
@@ -85,8 +85,16 @@ class Odrive(Driver[OdriveAxis]):
         self._table_writer = CycleTableWriter(self.tables, self._axes, self._error_requests, self._requests)
         self._setpoints = SetpointSender(self._axes, self.tables.setpoints, self._wire, drives.quick_stop_deceleration)
 
-    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:  # noqa: ARG002
-        """Check the drives and prepare them, without power, for a cycle of `period` seconds. `fastest` is not used.
+    def configure(
+        self,
+        period: float,
+        fastest: float | None = None,  # noqa: ARG002
+        *,
+        travel: Travel | None = None,  # noqa: ARG002
+        awaits: bool = False,
+    ) -> None:
+        """Check the drives and prepare them, without power, for a cycle of `period` seconds. `fastest` and `travel`
+        are not used.
 
         With `awaits`, a drive that does not answer causes a fault and is checked when it appears, and a missing bus
         causes a fault and is opened when it appears.

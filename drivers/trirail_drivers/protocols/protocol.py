@@ -46,7 +46,8 @@ class Protocol:
     cannot be inspected.
 
     Arguments: the bus, section [drives], the period [s], the clock, the velocity limit of the sliders [m/s], whether to
-    `apply` the changes, the digital outputs and inputs `io` of each drive, and the `timing` of the bus.
+    `apply` the changes, the digital outputs and inputs `io` of each drive, the `timing` of the bus, and the `travel` of
+    each slider [m].
     """
     check_exclusive: Callable[[can.BusABC, config.Drives, Clock], None]
     """Function that listens for another master, and raises DriveError if there is one."""

@@ -31,6 +31,7 @@ from trirail_drivers.interface import (
     Feedback,
     MissingProtection,
     PowerState,
+    Travel,
     Triple,
     Unready,
     UnreadyDrives,
@@ -425,7 +426,9 @@ class _RecordedDrives:
         """None for each drive, because `read` reports the faults."""
         return None, None, None
 
-    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
+    def configure(
+        self, period: float, fastest: float | None = None, *, travel: Travel | None = None, awaits: bool = False
+    ) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
@@ -482,5 +485,5 @@ def _simulated_drives(records: NDArray[np.void], config: Config, clock: _Simulat
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
     drives = connect(can, config.drives, clock, io=config.drive_io)
-    drives.configure(config.period, config.limits.slider.fastest)
+    drives.configure(config.period, config.limits.slider.fastest, travel=config.limits.slider.positions)
     return drives

@@ -61,10 +61,10 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
             f"drives of protocol {protocol} have no objects to show: find the drives with trirail commission"
         )
     with open_bus(settings.can, settings.drives) as bus:
-        fastest = settings.limits.slider.fastest
-        cycle = settings.period, time.monotonic, fastest
+        slider = settings.limits.slider
+        cycle = settings.period, time.monotonic, slider.fastest
         io, timing = settings.drive_io, settings.can.timing
-        reports = inspect(bus, settings.drives, *cycle, apply=apply, io=io, timing=timing)
+        reports = inspect(bus, settings.drives, *cycle, apply=apply, io=io, timing=timing, travel=slider.positions)
     fit = not any(each["refused"] for each in reports)
     if json:
         terminal.json({"ok": fit, "applied": apply, "drives": reports})

@@ -95,7 +95,7 @@ def open_steps(
             if driver is None and clock is not simulated:
                 check(bus, config.drives, clock)
             driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.timing, config.drives, clock)
-            driver.configure(config.period, config.limits.slider.fastest)
+            driver.configure(config.period, config.limits.slider.fastest, travel=config.limits.slider.positions)
             ticker = Ticker(round(config.period * 1e9))
             tick = simulated.tick if clock is simulated else lambda: ticker.wait().missed
             return Bench(config, driver, tick, interrupted)

@@ -68,11 +68,11 @@ class Session:
         if inspect is None:
             words = (f"drives of protocol {drives.protocol} have no objects to inspect; the next step finds them",)
             return Judgement("ok", words), {}
-        fastest = self._config.limits.slider.fastest
-        cycle = self._config.period, time.monotonic, fastest
+        slider = self._config.limits.slider
+        cycle = self._config.period, time.monotonic, slider.fastest
         bus, io, timing = self.environment.bus, self._config.drive_io, self._config.can.timing
         try:
-            self._inspected = inspect(bus, drives, *cycle, apply=False, io=io, timing=timing)
+            self._inspected = inspect(bus, drives, *cycle, apply=False, io=io, timing=timing, travel=slider.positions)
         except DriveError as error:
             return Judgement("failed", (str(error),), "follow the line above, then repeat this step"), {}
         lines = tuple(

@@ -101,7 +101,8 @@ class _Rehearsal:
     def run(self) -> None:
         """Run all steps of the rehearsal."""
         try:
-            self._drives.configure(self._config.period, self._config.limits.slider.fastest)
+            slider = self._config.limits.slider
+            self._drives.configure(self._config.period, slider.fastest, travel=slider.positions)
             self._loop.run(Ticker(round(self._config.period * 1e9), lambda: self._now_ns, self._pass))
         finally:
             self._clock.release()
@@ -227,7 +228,8 @@ def main(
         # Simulated drives that have died are restarted only with the whole service, so do not wait for them.
         awaits = config.can.interface != "simulated"
         drives = connect(bus(), config.drives, capture=capture, awaits=awaits, io=config.drive_io)
-        drives.configure(config.period, config.limits.slider.fastest, awaits=True)
+        slider = config.limits.slider
+        drives.configure(config.period, slider.fastest, travel=slider.positions, awaits=True)
         lacking = (*realtime.acquire(config.loop), *unrehearsed)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
 
