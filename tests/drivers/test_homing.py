@@ -21,6 +21,7 @@ import pytest
 from canopen.profiles.p402 import BaseNode402
 from conftest import Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
 from control_rig import CONFIG
+from drivers.test_foreign import MAKES
 from edsfiles import make_eds
 from refusals import refusal
 from trirail.config import Config, geometry
@@ -266,6 +267,25 @@ def test_a_drive_in_mode_7_starts_its_homing_when_it_is_told_to(robots: Robots, 
     assert rig.control.measured.feedback.homed == (True, True, True)
     assert words == [canopen_frames.ENABLE_OPERATION] * 3
     assert modes(rig) == [7, 7, 7]
+
+
+@pytest.mark.parametrize("method", [19, 37])
+@pytest.mark.parametrize("make", ["elmo_gold", "maxon_epos4_compact50_5", "nanotec_pd4n", "ros2_cia402_slave"])
+def test_drives_of_several_makes_are_homed(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make: str, method: int
+) -> None:
+    with_target_reached(monkeypatch)
+    robot = incremental(method)
+    keys = {"eds": str(make_eds(tmp_path, make)), **MAKES[make].keys}
+    if not make.startswith("maxon"):  # the others do not tell it
+        keys["velocity_unit"] = "counts/s"
+    each = {name: msgspec.structs.replace(getattr(robot.drives, name), **keys) for name in "ABC"}
+    rig = robots(msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, **each)), part_of_a_cycle)
+    rig.enable()
+    assert isinstance(rig.command("home"), CommandDone)
+    assert rig.control.measured.feedback.homed == (True, True, True)
+    expected = true_positions(rig) if method == 19 else HOMES
+    assert rig.control.measured.feedback.position == pytest.approx(expected, abs=1e-6)
 
 
 def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
