@@ -485,5 +485,5 @@ def _simulated_drives(records: NDArray[np.void], config: Config, clock: _Simulat
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
     drives = connect(can, config.drives, clock, io=config.drive_io)
-    drives.configure(config.period, config.limits.slider.fastest, travel=config.limits.slider.positions)
+    drives.configure(config.period, config.limits.slider.fastest)
     return drives

@@ -136,7 +136,7 @@ def _measure(config: Config, folder: Path, seconds: float) -> Iterator[float | C
     capture = Capture() if config.telemetry.capture_can else None
     try:
         drives = _connect_simulated(config, folder / "drives", capture)
-        drives.configure(config.period, config.limits.slider.fastest, travel=config.limits.slider.positions)
+        drives.configure(config.period, config.limits.slider.fastest)
     except DriveError as error:
         raise ServiceError(f"simulated drives: {error}") from error
     realtime.acquire(config.loop)

@@ -101,8 +101,7 @@ class _Rehearsal:
     def run(self) -> None:
         """Run all steps of the rehearsal."""
         try:
-            slider = self._config.limits.slider
-            self._drives.configure(self._config.period, slider.fastest, travel=slider.positions)
+            self._drives.configure(self._config.period, self._config.limits.slider.fastest)
             self._loop.run(Ticker(round(self._config.period * 1e9), lambda: self._now_ns, self._pass))
         finally:
             self._clock.release()
@@ -229,7 +228,8 @@ def main(
         awaits = config.can.interface != "simulated"
         drives = connect(bus(), config.drives, capture=capture, awaits=awaits, io=config.drive_io)
         slider = config.limits.slider
-        drives.configure(config.period, slider.fastest, travel=slider.positions, awaits=True)
+        travel = slider.positions if awaits else None  # the limits of simulated drives are an EDS's default values
+        drives.configure(config.period, slider.fastest, travel=travel, awaits=True)
         lacking = (*realtime.acquire(config.loop), *unrehearsed)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
 
