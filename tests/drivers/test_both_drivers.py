@@ -148,6 +148,17 @@ def test_a_drive_that_is_left_out_and_gets_power_stops_the_one_that_is_enabled(r
     assert ready.cycles(500).state[0] == OFF[0]
 
 
+def test_a_drive_that_kept_its_power_and_is_then_left_out_is_named_with_the_command_that_it_ignored(
+    enabled: AnyRig,
+) -> None:
+    enabled.keep_power(1)
+    enabled.drives.disable()
+    enabled.cycles(20)
+    enabled.drives.enable("A")
+    said = f"drive B: {enabled.keeps_power.format('disable')}"
+    assert enabled.found("timeout", within=1010) == ("B", "timeout", 0, said)
+
+
 def test_a_drive_that_is_left_out_and_has_power_for_a_moment_stops_no_other(ready: AnyRig) -> None:
     ready.drives.enable("A")
     ready.cycles(300)

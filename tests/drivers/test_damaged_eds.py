@@ -148,6 +148,7 @@ def test_objects_that_are_listed_and_not_described_are_told(tmp_path: Path) -> N
         ("ObjectType=8\nDataType=7\nAccessType=rw\nCompactSubObj=2\n", True),
         ("ObjectType=9\nSubNumber=x\n[5000sub0]\nParameterName=a\nDataType=7\nAccessType=rw\n", True),
         ("ObjectType=9\nSubNumber=3\n[5000sub2]\nParameterName=a\nDataType=7\nAccessType=rw\n", True),
+        ("ObjectType=7\nDataType=7\nAccessType=rw\nSubNumber=1\n", True),
         ("SubNumber=3\n[5000sub0]\nParameterName=a\nDataType=7\nAccessType=rw\n", False),
     ],
 )

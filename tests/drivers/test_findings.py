@@ -186,7 +186,7 @@ def test_a_drive_that_can_only_coast_is_told_of(key: Key, apply: bool) -> None:
     assert [title(key) in str(each) and "the drive coasts" in str(each) for each in found["notes"]] == [True]  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(("held", "then"), [(0, 1), (1, 1), (2, 1), (4, 1), (None, None)])
+@pytest.mark.parametrize(("held", "then"), [(0, 1), (1, 1), (2, 2), (4, 4), (None, None)])
 def test_a_halt_of_homing_brakes(held: int | None, then: int | None) -> None:
     """605Dh; a drive without the object has a stop of its own."""
     with Line(SERVO) as line:
@@ -206,6 +206,20 @@ def test_a_drive_may_keep_another_halt_that_brakes(held: int) -> None:
         found = set_up(line, apply=True)
     assert not found["refused"]
     assert not found["lacking"]
+
+
+@pytest.mark.parametrize("held", [0, 2])
+def test_a_drive_that_acknowledges_another_halt_but_keeps_its_own_may_do_so_if_it_brakes(held: int) -> None:
+    with Line(SERVO) as line:
+        entry = fit(line, (0x605D, 0), held)
+
+        def kept(entry: ObjectEntry, _before: object) -> None:
+            entry.value = held
+
+        entry.on_write = kept
+        found = set_up(line, apply=True)
+    assert ("605D" in str(found["refused"]) and "accept_without" in str(found["refused"])) == (held == 0)
+    assert bool(found["refused"]) == (held == 0)
 
 
 def test_a_drive_without_homing_keeps_its_halt() -> None:

@@ -250,7 +250,6 @@ def test_a_drive_in_the_place_of_another_is_refused_by_name(rig: RecoveryRig) ->
 
 SCALING: dict[tuple[int, int], tuple[int, int, int, str]] = {
     (0x607E, 0): (8, 0xC0, 0, "polarity) is 00h, was C0h"),
-    (0x6080, 0): (32, 5000, 1000, "max motor speed) is 1000, was 5000"),
     (0x608F, 1): (32, 4096, 1, "position encoder resolution) is 1, was 4096"),
     (0x6091, 1): (32, 10, 1, "gear ratio) is 1, was 10"),
     (0x6092, 2): (32, 2, 1, "feed constant) is 1, was 2"),

@@ -33,7 +33,6 @@ _POLARITIES: Final = 0xC0
 _FACTORS: Final = {0x60A9: 0x6096, 0x60AA: 0x6097}
 _SCALING: Final = {
     0x607E: "polarity",
-    0x6080: "max motor speed",
     0x6089: "position notation index",
     0x608A: "position dimension index",
     0x608B: "velocity notation index",

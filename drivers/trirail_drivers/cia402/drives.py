@@ -405,7 +405,6 @@ class Cia402(Driver[Cia402Axis]):
         if self._wire.fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
         self._wanted = PowerState.OPERATION_ENABLED
-        self._times.off_deadline = math.inf
         for axis in self._axes:
             axis.powered_up = axis.has_followed = False
             axis.mode.shown = axis.exchange.mode_shown

@@ -189,10 +189,11 @@ def _check_end(file: Path, sections: list[Section]) -> None:
     index = next((each.object for each in reversed(sections) if each.object is not None), None)
     own = [each for each in sections if each.object == index]
     main = next((each for each in own if not each.parent), None)
-    if main is None or main.number("CompactSubObj"):
+    kind = main.number("ObjectType") if main is not None else None
+    if main is None or main.number("CompactSubObj") or kind not in (None, *_WITH_SUB_OBJECTS):
         return
     described = [int(each.name[7:], 16) for each in own if each.name[4:7] == "sub"]
-    wanted = main.number("SubNumber") or (1 if main.number("ObjectType") in _WITH_SUB_OBJECTS else 0)
+    wanted = main.number("SubNumber") or (1 if kind in _WITH_SUB_OBJECTS else 0)
     # Some manufacturers give the highest subindex plus 1, although subindices between are missing.
     if max(len(described), *(1 + each for each in described), 0) < wanted:
         raise DriveError(

@@ -123,6 +123,8 @@ DISABLE_VOLTAGE_OPTION: Final = 2
 """Value of 6007h with which a drive that has lost its master removes power without a ramp."""
 DISABLE_DRIVE_OPTION: Final = 0
 """Value of 605Eh with which a drive in fault removes power without a ramp."""
+BRAKING_HALTS: Final = (1, 2, 3, 4)
+"""Values of 605Dh with which a drive brakes when a homing is halted; with others, it may coast."""
 MAX_FOLLOWING_TIMEOUT_MS: Final = 100
 """Maximum time for which a following error may exceed its window before the drive reacts [ms]."""
 
@@ -150,8 +152,12 @@ async def configure_reactions(drive: Differences, drives: Drives, units: Units) 
 async def configure_homing(drive: Differences, homing: Homing, units: Units) -> None:
     """Configure the drive's homing: 605Dh, 6098h, 6099h, 609Ah, 607Ch."""
     name = drive.remote.name
-    # 605Dh = 1: halt, which stops a homing, follows a ramp. With the values 2 to 4 the drive brakes too; 0 coasts.
-    await drive.ensure(0x605D, 0, 1, also=(2, 3, 4))
+    halt = await drive.remote.peek(0x605D)
+    if halt not in BRAKING_HALTS:
+        try:
+            await drive.ensure(0x605D, 0, BRAKING_HALTS[0], also=BRAKING_HALTS[1:])
+        except ConfigurationRefused as error:
+            drive.lack((0x605D, 0), f"it keeps {halt}", error)
     await drive.ensure(0x6098, 0, homing.method)
     await drive.ensure(0x6099, 1, units.speed(name, "homing.speed_switch", homing.speed_switch))
     await drive.ensure(0x6099, 2, units.speed(name, "homing.speed_zero", homing.speed_zero))

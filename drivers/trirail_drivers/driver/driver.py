@@ -317,7 +317,9 @@ class Driver(ABC, Generic[AnyAxis]):
         times, enabled = self._times, self._wants_power()
         off = [axis for axis in self._axes if axis.left_out or not enabled]
         unwanted = any(self._has_power(axis) for axis in off)
-        if times.off_deadline == math.inf and unwanted and not self._power_reported:
+        if enabled and not unwanted:
+            times.off_deadline = math.inf
+        elif times.off_deadline == math.inf and unwanted and not self._power_reported:
             self._start_stop_timer("it got power by itself")
         if now < times.off_deadline:
             return

@@ -236,7 +236,6 @@ class Odrive(Driver[OdriveAxis]):
             return
         self._enabled = True
         self._setpoints.begin()
-        self._times.off_deadline = math.inf
         for axis in self._axes:
             axis.powered_up = False
             axis.left_out = alone not in (None, axis.name)

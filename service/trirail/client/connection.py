@@ -145,7 +145,10 @@ class Connection:
         at_door = stop.at_door(self._connect, self._credentials, lambda outcome: deliver(self._note_sequence(outcome)))
         try:
             query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
-            threading.Thread(target=self._post_stop, args=(query, deliver), name="stop over Zenoh", daemon=True).start()
+            try:
+                threading.Thread(target=self._post_stop, args=(query, deliver), name="zenoh stop", daemon=True).start()
+            except RuntimeError:  # while the interpreter ends, it starts no thread
+                self._post_stop(query, deliver)
             yield Outcomes(2 if at_door is not None else 1)
         finally:
             if at_door is not None:
