@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tarfile
@@ -34,11 +35,15 @@ print(abs(way - inverse(Geometry.symmetric(0.3), (0.01, 0.0, 0.05)).position).ma
 def run(arguments: Sequence[object], folder: Path) -> str:
     """Run a program in a folder, as a user who has not heard of the checkout; return what it prints."""
     environment = {name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "VIRTUAL_ENV"}}
-    done = subprocess.run(
-        list(map(str, arguments)), cwd=folder, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr + done.stdout
-    return done.stdout
+    words, pipe = list(map(str, arguments)), subprocess.PIPE
+    with subprocess.Popen(words, cwd=folder, env=environment, stdout=pipe, stderr=pipe, text=True) as process:
+        try:
+            printed, errors = process.communicate()
+        except BaseException:  # a time limit: the program ends its service; if it were killed, the service would go on
+            process.send_signal(signal.SIGINT)
+            raise
+    assert process.returncode == 0, errors + printed
+    return printed
 
 
 @pytest.fixture(scope="module")
