@@ -926,7 +926,7 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> N
             **{
                 'interface = "simulated"': f'interface = "unix"\nchannel = "{bus}"',
                 "rate_hz = 1000": "rate_hz = 20",
-                "heartbeat = 0.1": "heartbeat = 0.5",
+                "heartbeat = 0.1": "heartbeat = 0.5\nsdo_timeout = 5.0",
             },
         )
         service.wait_up()
