@@ -45,3 +45,14 @@ def test_a_file_for_sleep_states_that_cannot_be_opened_ends_nothing(monkeypatch:
     monkeypatch.setattr(os, "open", forbidden)
     assert realtime.acquire(CONFIG.loop) == ()
     assert opened == ["/dev/cpu_dma_latency"]
+
+
+@pytest.mark.parametrize(("inherited", "score"), [(0, 500), (300, 800), (500, 1000), (900, 1000), (1000, 1000)])
+def test_the_recorder_ends_first_whatever_score_the_service_inherits(inherited: int, score: int) -> None:
+    code = (
+        "from pathlib import Path; from trirail.processes.realtime import offer_to_oom_killer; "
+        f"file = Path('/proc/self/oom_score_adj'); file.write_text('{inherited}'); "
+        "offer_to_oom_killer(); print(int(file.read_text()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == (f"{score}\n", "")
