@@ -14,6 +14,7 @@ def main() -> None:
     Loading the command line takes a third of a second; during that time, Ctrl-C ends the process at signal level.
     """
     _open_standard_streams()
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())  # the program that has started this one may have blocked signals
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a command that has acted must not fail as it reports that
             stream.reconfigure(errors="backslashreplace")

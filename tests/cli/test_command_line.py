@@ -593,9 +593,11 @@ def test_a_goal_of_a_service_that_has_restarted_is_waited_for_no_longer() -> Non
         terminal.follow(robot, goal, "away", show=False)
 
 
-def test_ctrl_c_while_a_command_is_loaded_ends_it_without_a_word() -> None:
+@pytest.mark.parametrize("starter", ["", "signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())"])
+def test_ctrl_c_while_a_command_is_loaded_ends_it_without_a_word(starter: str) -> None:
+    """Whatever signals the program that has started it blocks: a service could not be ended otherwise."""
     loading = (
-        "import signal, sys, os\n"
+        f"import signal, sys, os\n{starter}\n"
         "class Loading:\n"
         "    def find_spec(self, name, *_):\n"
         "        if name == 'cyclopts': os.kill(os.getpid(), signal.SIGINT)\n"
