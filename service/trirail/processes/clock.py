@@ -46,7 +46,12 @@ def now_ns(moment: NDArray[np.int64]) -> int:
 
 @compiled()
 def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
-    """Sleep until the deadline, even if signals interrupt the sleep; `moment` is the same as for `now_ns`."""
+    """Sleep until the deadline, even if signals interrupt the sleep; `moment` is the same as for `now_ns`.
+
+    A sleep to a time that has passed would still take as long as the kernel needs to wake up a thread, 25 µs or more.
+    """
+    if now_ns(moment) >= deadline_ns:
+        return
     moment[0], moment[1] = deadline_ns // _SECOND, deadline_ns % _SECOND
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, moment.ctypes.data, 0) == _INTERRUPTED:
         pass
