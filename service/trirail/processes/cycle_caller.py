@@ -37,6 +37,8 @@ _IDLE_LAW = constant_law(1.0)
 _EMPTY_PATH = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
 """Law and path that are passed to compiled code if there is no motion."""
 
+_WRITTEN_IN_SOLVE = [name for name in cycle_core.RobotArrays._fields if name not in ("legs", "packed")]
+
 
 class CallResult(NamedTuple):
     """Result of the compiled call, which describes the newest cycle that the call has begun."""
@@ -158,6 +160,9 @@ class CycleCaller:
         self._output_state = self._outputs.add(control.outputs.state)
         self._output_words = self._outputs.add(control.outputs.words)
         self._table = self._robot_table
+        self._rehearsed = _Copies()
+        self._rehearsal: tuple[Any, ...] = ()
+        """Arrays of a rehearsal that stay the same until the tables are prepared again."""
         state = self._state
         self.parts_ns = state.parts_ns
         """Durations of the parts of the newest cycle [ns], in the memory to which compiled code writes."""
@@ -299,7 +304,7 @@ class CycleCaller:
         self._control.measured.feedback = feedback
         pack_feedback(feedback, self._robot.feedback, self._robot.record)
         first, moment, frames, robot = self._tables
-        reached = cycle_core.solve(first, moment, frames, robot, self._motion[0])
+        reached = cycle_core.solve(first, moment, frames, robot, self._motion[1])
         return Reached.SOLVED if reached == cycle_core.CONTINUE else Reached(reached)
 
     def is_refused(self, reached: Reached) -> bool:
@@ -416,7 +421,15 @@ class CycleCaller:
             times=tables.times,
             history=tables.history,
         )
-        return np.frombuffer(memoryview(self._state), STATE), self._moment, frames, self._robot
+        state = np.frombuffer(memoryview(self._state), STATE)
+        self._rehearsed = _Copies()
+        copied, robot = self._rehearsed.add, self._robot
+        self._rehearsal = (
+            copied(state),
+            frames._replace(axes=copied(frames.axes), setpoints=copied(frames.setpoints)),
+            robot._replace(**{name: copied(getattr(robot, name)) for name in _WRITTEN_IN_SOLVE}),
+        )
+        return state, self._moment, frames, robot
 
     def _robot_arrays(self) -> cycle_core.RobotArrays:
         """Return copies of the control's arrays for compiled code."""
@@ -438,13 +451,17 @@ class CycleCaller:
             packed=record.view(np.uint8),
         )
 
-    def _motion_arguments(self, run: Run | None) -> tuple[cycle_core.MotionArrays, cycle_core.OutputArrays]:
+    def _motion_arguments(self, run: Run | None) -> tuple[Any, ...]:
         """Return the arguments of the compiled function that depend on the motion."""
         path, law = (run.path, run.law) if run is not None else (_EMPTY_PATH, _IDLE_LAW)
         self._furthest = _Copies()
         furthest = self._furthest.add(run.furthest if run is not None else self._nothing)
         self._table = np.concatenate((self._robot_table, self._outputs.table, self._furthest.table))
+        rehearsed = _Copies()
+        rehearsal = *self._rehearsal, rehearsed.add(furthest)
+        table = np.concatenate((self._rehearsed.table, rehearsed.table))
         outputs = self._control.outputs
         outputs.prepare(run, self._control.schedule.version)
         motion = cycle_core.MotionArrays(path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest)
-        return motion, cycle_core.OutputArrays(self._output_state, outputs.planned, self._output_words, outputs.log)
+        switching = cycle_core.OutputArrays(self._output_state, outputs.planned, self._output_words, outputs.log)
+        return cycle_core.Rehearsal(table, *rehearsal), motion, switching

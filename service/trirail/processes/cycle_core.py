@@ -158,6 +158,17 @@ class MotionArrays(NamedTuple):
     furthest: Array
 
 
+class Rehearsal(NamedTuple):
+    """Copies of the arrays that `solve` changes. A cycle first computes its setpoints with them, without any effect."""
+
+    copies: NDArray[np.int64]
+    """Table of the copies, as in `copy_state`."""
+    state: NDArray[np.void]
+    frames: FrameTables
+    robot: RobotArrays
+    furthest: Array
+
+
 class OutputArrays(NamedTuple):
     """Tables of outputs, the same as in trirail.control.outputs.switch."""
 
@@ -185,6 +196,7 @@ _ROBOT = _typed(
     *(f8[:, ::1], types.b1[::1], f8[:, ::1], cycle.MONITORED, cycle.RECORD, u1[::1]),
 )
 _MOTION = _typed(MotionArrays, cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1])
+_REHEARSAL = _typed(Rehearsal, i8[:, ::1], _STATE, _FRAME_TABLES, _ROBOT, f8[::1])
 _OUTPUTS = _typed(OutputArrays, outputs.OUTPUTS, outputs.PLAN, i8[::1], outputs.LOG)
 
 
@@ -236,7 +248,14 @@ def _receive(s: Any, moment: NDArray[np.int64], frames: FrameTables, t: float) -
 
 
 @compiled()
-def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neighbours, frames: FrameTables) -> int:
+def _begin(
+    state: NDArray[np.void],
+    moment: NDArray[np.int64],
+    neighbours: Neighbours,
+    frames: FrameTables,
+    motion: MotionArrays,
+    rehearsal: Rehearsal,
+) -> int:
     """Wait for the tick, and send the frames at the start of a cycle. Return CONTINUE, or the reached stage."""
     s, times = state[0], frames.times
     s.deadline_ns += s.period_ns
@@ -246,6 +265,7 @@ def _begin(state: NDArray[np.void], moment: NDArray[np.int64], neighbours: Neigh
     # The frames that have arrived answer the previous SYNC. Nothing is left to do between the deadline and SYNC.
     if not _receive(s, moment, frames, _now_ns(state, moment) / 1e9):
         return Reached.WAITED
+    _rehearse(state, moment, motion, rehearsal)
     s.marked_ns = now = _busy_wait(state, moment)
     s.lateness_ns = now - s.deadline_ns
     s.missed = max(0, s.lateness_ns // s.period_ns)
@@ -415,6 +435,23 @@ def copy_state(copies: NDArray[np.int64], back: bool) -> None:
 
 
 @compiled()
+def _rehearse(state: NDArray[np.void], moment: NDArray[np.int64], motion: MotionArrays, rehearsal: Rehearsal) -> None:
+    """Compute the next setpoints on copies, if there is time before the tick; this moves code and data to the caches.
+
+    The setpoints are then sent 1.6 µs earlier on a processor with 12 µs from the tick to the setpoints.
+    """
+    s = state[0]
+    if s.injected_ns < 0 and now_ns(moment) > s.deadline_ns - s.busy_wait_ns // 3:
+        return
+    copy_state(rehearsal.copies, False)
+    rehearsal.state[0].synced = _now_ns(state, moment) / 1e9
+    copied = MotionArrays(
+        *(motion.knots, motion.pieces, motion.tools, motion.law_knots, motion.law_pieces, rehearsal.furthest)
+    )
+    solve(rehearsal.state, moment, rehearsal.frames, rehearsal.robot, copied)
+
+
+@compiled()
 def _may_switch(s: Any, motion: MotionArrays, tables: OutputArrays) -> bool:
     """Return True if an output may switch in one of the next cycles that could run beside a decision."""
     for k in range(len(tables.switches)):
@@ -490,10 +527,11 @@ def _run_cycle(
     robot: RobotArrays,
     motion: MotionArrays,
     tables: OutputArrays,
+    rehearsal: Rehearsal,
 ) -> int:
     """Run one cycle. Return CONTINUE, or the stage that it has reached if Python must go on."""
     s = state[0]
-    reached = _begin(state, moment, neighbours, frames)
+    reached = _begin(state, moment, neighbours, frames, motion, rehearsal)
     if reached == CONTINUE:
         reached = _read(state, moment, neighbours, frames, robot.feedback)
     if reached == CONTINUE:
@@ -523,6 +561,7 @@ def _run_cycles(
     motion: MotionArrays,
     tables: OutputArrays,
     copies: NDArray[np.int64],
+    rehearsal: Rehearsal,
 ) -> int:
     """Run cycles until Python is needed; return the stage that the newest cycle has reached."""
     s = state[0]
@@ -534,7 +573,7 @@ def _run_cycles(
                 requested = _request_decision(state, moment, neighbours, motion, tables, copies)
                 if requested and s.injected_ns >= 0:
                     return Reached.DONE
-        reached = _run_cycle(state, moment, neighbours, frames, robot, motion, tables)
+        reached = _run_cycle(state, moment, neighbours, frames, robot, motion, tables, rehearsal)
         if reached != CONTINUE:
             return reached
         if (s.called or s.decides) and not s.deciding:
@@ -544,7 +583,9 @@ def _run_cycles(
     return Reached.DONE
 
 
-@compiled(i8(_STATE, i8[::1], i8[:, ::1], _NEIGHBOURS, _FRAME_TABLES, _ROBOT, _MOTION, _OUTPUTS), releases=True)
+@compiled(
+    i8(_STATE, i8[::1], i8[:, ::1], _NEIGHBOURS, _FRAME_TABLES, _ROBOT, _REHEARSAL, _MOTION, _OUTPUTS), releases=True
+)
 def run(
     state: NDArray[np.void],
     moment: NDArray[np.int64],
@@ -552,6 +593,7 @@ def run(
     neighbours: Neighbours,
     frames: FrameTables,
     robot: RobotArrays,
+    rehearsal: Rehearsal,
     motion: MotionArrays,
     tables: OutputArrays,
 ) -> int:
@@ -574,7 +616,7 @@ def run(
     if not s.deciding:
         copy_state(copies, False)
         s.ends = _next_end(s, motion, s.cycle, s.code)
-    reached = _run_cycles(state, moment, neighbours, frames, robot, motion, tables, copies)
+    reached = _run_cycles(state, moment, neighbours, frames, robot, motion, tables, copies, rehearsal)
     if not s.deciding:
         copy_state(copies, True)
     return reached
