@@ -7,6 +7,9 @@ import os
 import select
 import signal
 import socket
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -26,6 +29,7 @@ from processes.test_service import (
     until,
 )
 from processes.test_service import told as told_by
+from trirail.client import own_service
 from trirail.processes.supervisor import CHILDREN_WITH_DRIVES
 from trirail.telemetry.reading import read
 from trirail.telemetry.recording import Recording
@@ -270,3 +274,28 @@ def test_the_fork_server_has_of_the_supervisors_descriptors_those_it_hands_on_al
         + ["/memfd:trirail-heartbeats (deleted)"]
         + ["anon_inode"] * len(CHILDREN_WITH_DRIVES)
     )
+
+
+def test_a_private_service_ends_with_the_program_that_has_started_it_however_that_ends(tmp_path: Path) -> None:
+    """A program that is killed cannot end what it has started."""
+    config, locator = own_service.private(tmp_path)
+    code = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from trirail.client import own_service\n"
+        "from trirail.client.client import Robot\n"
+        f"process = own_service.start(Path({str(config)!r}), open({str(tmp_path / 'log')!r}, 'wb'))\n"
+        f"with Robot('demo', {locator!r}) as robot:\n"
+        "    robot.enable()\n"
+        "print(process.pid, flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL
+    supervisor = Path(f"/proc/{int(done.stdout)}")
+    deadline = time.monotonic() + WITHIN
+    while supervisor.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    log = (tmp_path / "log").read_text()
+    assert "the program that started this service has ended: stopping the robot and disabling the drives" in log

@@ -170,7 +170,9 @@ def test_the_loop_stops_the_robot_when_the_supervisor_is_lost(systemd: Systemd, 
         robot.enable()
         robot.move_to(x=0.15, y=0.0, phi=0.0, speed=0.03)
         loop, gateway, recorder = (child(systemd.main_pid, name) for name in ("loop", "gateway", "recorder"))
-        systemd.until(lambda: score(recorder) == min(score(loop) + 500, 1000))  # if memory runs out, the recorder ends first
+        systemd.until(
+            lambda: score(recorder) == min(score(loop) + 500, 1000)
+        )  # if memory runs out, the recorder ends first
         assert score(loop) == score(gateway)
         systemd.ctl("kill", "--kill-whom=main", f"--signal={harm}", "trirail")
     systemd.until(systemd.shows(ActiveState="active", NRestarts="1"))

@@ -17,7 +17,7 @@ from typing import IO
 
 from trirail.config import SIM
 from trirail.errors import RefusedError, ServiceError, TrirailError
-from trirail.processes.operating_system import python
+from trirail.processes.operating_system import STARTER, python
 
 PATIENT = {
     "max_overruns": "1000",
@@ -68,7 +68,8 @@ def start(
     report_start: Callable[[str], None] = lambda _: None,
     **environment: str,
 ) -> Process:
-    """Start a service, and wait until the service is up; the caller must `end` the service.
+    """Start a service, and wait until the service is up; the caller must `end` the service. It also ends if the calling
+    process ends in another way, such as by SIGKILL.
 
     `arguments` are appended to the command `trirail run`, and `environment` is added to the environment variables. The
     output is written to `log`. The service reports with systemd's notification protocol that it is up. A query on the
@@ -84,7 +85,7 @@ def start(
             stdout=log,
             stderr=log,
             start_new_session=True,
-            env=os.environ | {"NOTIFY_SOCKET": ready.getsockname()} | environment,
+            env=os.environ | {"NOTIFY_SOCKET": ready.getsockname(), STARTER: str(os.getpid())} | environment,
         )
         try:
             _wait(process, ready, report_start)

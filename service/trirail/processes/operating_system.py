@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import select
 import signal
 import socket
 import sys
@@ -120,6 +121,30 @@ class Signals:
             signal.signal(number, handler)
         self.reader.close()
         self._writer.close()
+
+
+STARTER = "TRIRAIL_ENDS_WITH"
+"""Environment variable with the number of the process with which a service ends, however that process ends."""
+
+
+class Starter:
+    """Process that has started the service for itself alone, if there is one."""
+
+    def __init__(self) -> None:
+        self._process: int | None = None
+        self.gone = False
+        """True if the process had ended before the service started."""
+        if number := os.environ.pop(STARTER, ""):
+            try:
+                self._process = os.pidfd_open(int(number))
+            except ProcessLookupError:
+                self.gone = True
+
+    def has_ended(self) -> bool:
+        """Return True if there was such a process, and it has ended."""
+        if self._process is not None and select.select([self._process], [], [], 0)[0]:
+            self.gone = True
+        return self.gone
 
 
 SEND_WITHIN = 0.3

@@ -21,7 +21,7 @@ from trirail.processes.ending import loop_ends_within
 from trirail.processes.forked_processes import ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
 from trirail.processes.monitoring import MIN_SILENT_CYCLES, Health, Running
-from trirail.processes.operating_system import Signals, Watchdog, notify
+from trirail.processes.operating_system import Signals, Starter, Watchdog, notify
 from trirail.processes.order import Order
 from trirail.processes.realtime import release_startup_memory
 from trirail.processes.sockets import raise_descriptor_limit
@@ -129,6 +129,7 @@ class Supervisor:
         }
         self._health = Health(self._heartbeats, config.period, CHECK_PERIOD_S)
         self._watchdog = Watchdog([self._heartbeats.heart(name) for name in WATCHED_BY_SYSTEMD])
+        self._starter = Starter()
         self._newest_event = 0
         self._next_turn = 0.0
         self._progress_at = 0.0
@@ -198,6 +199,8 @@ class Supervisor:
                 while child is not None and child.compiling:
                     self._progress_at = time.monotonic()
                     progress.begin(child.compiling.pop(0))
+            if self._starter.has_ended() and not self._ending:
+                self._end_because("the program that started this service has ended", progress)
             if self._ending:
                 continue
             self._start_due()
@@ -222,8 +225,11 @@ class Supervisor:
             words = "the service cannot be suspended; Ctrl-C stops the robot and ends the service"
             self._report(f"{number.name}: {words}", "warning")
             return
+        self._end_because(number.name, progress)
+
+    def _end_because(self, reason: str, progress: Progress) -> None:
         ending = progress.interrupted if not self._up else "stopping the robot and disabling the drives"
-        self._report(f"{number.name}: {ending}", "info")
+        self._report(f"{reason}: {ending}", "info")
         self._ending = True
 
     def _kill_hung(self) -> None:
