@@ -3,7 +3,7 @@
 Hypothesis tests are generated, and so are those that draw from a seed: @pytest.mark.generated(0, 1, 2) on a test with
 an argument `seed` has it run with each of these, or with as many fresh ones. What exploring finds stays: as @example(…)
 of a hypothesis test, as one more seed of the others. --effort=0.1 tries a tenth of the examples, of the seeds and
-of the cases of each test that is marked as long or many, for `make test`: also these are the same at every run.
+of the cases of each test, for `make test`: also these are the same at every run.
 """
 
 from __future__ import annotations
@@ -107,12 +107,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _thin(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out all but a share of the cases of each test that is marked as long (one at least) or many (FEWEST)."""
+    """Leave out all but a share of the cases of each test; keep at least one of a long test, two of another."""
     cases: dict[tuple[str, int], list[pytest.Item]] = {}
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        if marks & {"long", "many"} and marks.isdisjoint({"core", "alone", "vcan"}):
-            fewest = 1 if "long" in marks else FEWEST
+        if marks.isdisjoint({"core", "alone", "vcan"}):
+            fewest = 1 if "long" in marks else 2
             cases.setdefault((item.nodeid.partition("[")[0], fewest), []).append(item)
     effort, left_out = config.getoption("effort"), []
     for (_, fewest), each in cases.items():

@@ -48,6 +48,7 @@ def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
         ("from trirail.processes import recording", {"numpy", "rerun"}),
     ],
 )
+@pytest.mark.long
 def test_each_name_loads_what_it_needs_and_no_more(statement: str, loaded: set[str]) -> None:
     assert loaded_by(statement) == loaded
 

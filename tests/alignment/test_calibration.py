@@ -283,6 +283,7 @@ def test_marks_that_are_swapped_in_one_look_are_refused(
 
 @pytest.mark.parametrize("lens", LENSES)
 @given(seed=SEEDS, by=st.floats(5e-4, 2e-3), turn=st.floats(5e-3, 0.05), data=st.data())
+@pytest.mark.long
 def test_a_late_picture_of_one_look_is_refused(
     lens: Lens, seed: int, by: float, turn: float, data: st.DataObject
 ) -> None:

@@ -28,7 +28,6 @@ def drawn(shape: MarkShape, turn: float, mirror: float, rng: np.random.Generator
 
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
 @pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.many
 def test_a_code_is_read_in_any_direction_and_placed(family: CodeFamily, mirror: float) -> None:
     rng = np.random.default_rng(4)
     for number in (0, 8, 17):
@@ -48,6 +47,7 @@ def test_codes_are_read_at_every_depth(bits: int) -> None:
     assert (found.mark.u, found.mark.v) == pytest.approx(at, abs=0.03)
 
 
+@pytest.mark.long
 def test_codes_are_placed_as_well_as_discs_of_their_size() -> None:
     rng = np.random.default_rng(5)
     codes, discs = [], []

@@ -127,6 +127,7 @@ def test_one_correction_anywhere_in_the_travel(name: str) -> None:
 @given(seed=SEEDS, name=names)
 @example(seed=0, name="uvw")
 @example(seed=678, name="uvw")
+@pytest.mark.long
 def test_lost_swapped_and_wrong_marks_are_named_and_change_nothing(seed: int, name: str) -> None:
     made, task = stage(name, seed, noise=0.05)
     look, count = made.look, 0
@@ -205,6 +206,7 @@ def test_what_no_look_tells_is_named_and_stays_as_configured() -> None:
     assert told
 
 
+@pytest.mark.long
 def test_one_camera_tells_less_than_two_and_says_so() -> None:
     made, task = stage("uvw", 4, noise=0.05)
     alone, _ = stage("uvw", 4, noise=0.05, part={"left": PART["left"]})
@@ -351,7 +353,6 @@ def test_impossible_arguments_are_refused_before_a_move(change: dict[str, object
 
 @pytest.mark.parametrize("name", sorted(STAGES))
 @pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.many
 def test_cameras_are_checked_within_the_travel_from_wherever_the_stage_stands(name: str, side: float) -> None:
     made, task = stage(name, 5)
     task = task._replace(approach=(2e-4, 2e-4, 1e-3))

@@ -35,6 +35,7 @@ def test_it_is_the_motion_that_was_made_whatever_the_weights(seed: int, n: int, 
 
 
 @pytest.mark.parametrize("n", [2, 3, 5])
+@pytest.mark.long
 def test_its_misfit_and_its_errors_are_as_large_as_the_weights_say(n: int) -> None:
     rng = np.random.default_rng(n)
     at, trials = part(rng, n), 3000

@@ -223,6 +223,7 @@ def test_urdf_goes_to_a_file_or_to_the_terminal(tmp_path: Path, capsys: pytest.C
         recording_commands.urdf(out=path)
 
 
+@pytest.mark.long
 def test_the_memory_of_an_export_does_not_grow_with_the_recording(recording: Recording) -> None:
     geometry = config.geometry(load(SIM).geometry)
 

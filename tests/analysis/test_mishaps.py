@@ -57,7 +57,6 @@ def end(shell: Shell) -> None:
 
 
 @pytest.mark.parametrize("happen", [lose_a_drive, push_a_slider, be_late, lose_the_gateway, freeze_the_gateway, end])
-@pytest.mark.many
 def test_a_mishap_comes_out_the_same(shell: Shell, happen: Callable[[Shell], None]) -> None:
     shell.cycles(40)  # without power, with the recorder there
     shell.enabled()

@@ -209,7 +209,6 @@ def test_a_folder_that_cannot_be_read_is_not_an_empty_one(
 
 @pytest.mark.parametrize("line", ["fk 0 0 0", "fk 0 0 0 --json", "fk 9 9 9 --json", "help all"])
 @pytest.mark.parametrize("unbuffered", thinned(["", "1"]))
-@pytest.mark.many
 def test_output_to_a_full_disk_is_an_error_in_one_line(line: str, unbuffered: str) -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(
@@ -277,6 +276,7 @@ def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code:
 
 
 @pytest.mark.parametrize("command", thinned(["stop", "status", "fleet", "view --web"], every=4))
+@pytest.mark.long
 def test_a_folder_of_the_environment_is_for_certificates_alone(
     command: str, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -445,6 +445,7 @@ def test_who_asks_for_a_command_that_there_is_not_is_led_to_the_list_of_them(run
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.long
 def test_the_completion_script_knows_commands_and_options(shell: str, run: Run) -> None:
     code, out, err = run("completion", shell)
     assert (code, err) == (0, "")
@@ -712,7 +713,7 @@ def test_an_endless_output_ends_with_its_reader(name: str) -> None:
 
 
 @pytest.mark.parametrize("line", ["help all", "goto --help", "--version", "ik 0 0 0", "ik 0 0 0 --json"])
-@pytest.mark.many
+@pytest.mark.long
 def test_help_and_results_into_a_closed_pipe_are_no_failure(line: str) -> None:
     reader, writer = os.pipe()
     os.close(reader)
@@ -819,7 +820,6 @@ SPEAKING = [
 
 @pytest.mark.parametrize("words", SPEAKING)
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "koi8-r", "shift_jis", "utf-8"])
-@pytest.mark.many
 def test_an_output_that_lacks_characters_ends_no_command(
     words: str, encoding: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -112,6 +112,7 @@ def test_back_leads_past_steps_that_cannot_run(robot: str, typed: int, capsys: p
 
 
 @pytest.mark.parametrize("done", [[], ["bus"], ["bus", "setup"]], ids=["at once", "before set-up", "afterwards"])
+@pytest.mark.long
 def test_ctrl_c_ends_it_and_the_report_stays(
     done: list[str],
     robot: str,

@@ -356,6 +356,7 @@ def test_whoever_waits_is_told_that_the_robot_was_closed(silent: Silent, locator
     asyncio.run(main())
 
 
+@pytest.mark.long
 def test_opening_that_is_cancelled_leaves_no_connection(silent: Silent, locator: str) -> None:
     async def main() -> None:
         opening = asyncio.ensure_future(AsyncRobot("demo", locator).__aenter__())

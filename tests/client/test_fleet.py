@@ -79,6 +79,7 @@ def test_who_needs_somebody_stands_first(hub: tuple[str, zenoh.Session]) -> None
         ]
 
 
+@pytest.mark.long
 def test_one_look_as_json(
     hub: tuple[str, zenoh.Session], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -72,6 +72,7 @@ def test_without_signs_nothing_is_renewed(hand: Hand) -> None:
     assert len(hand.robot.sent) == 1
 
 
+@pytest.mark.long
 def test_a_sign_that_has_waited_for_a_slow_service_is_thrown_away(hand: Hand) -> None:
     with hand.robot.hanging("goal"):
         hand.jog.hold(RIGHT)

@@ -151,6 +151,7 @@ def test_who_cannot_wait_for_the_standstill_gives_it_back(loop: LoopThread) -> N
 
 
 @pytest.mark.parametrize("error", PASSING)
+@pytest.mark.long
 def test_a_lease_outlasts_a_gateway_that_is_busy_or_restarted_within_its_time_out(error: TrirailError) -> None:
     """The loop still holds the lease: one of the four renewals within a time-out is enough."""
     asked: list[Command] = []

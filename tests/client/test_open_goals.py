@@ -132,6 +132,7 @@ async def hangs() -> None:
 
 @pytest.mark.usefixtures("hurried")
 @pytest.mark.parametrize("error", [ServiceError("no robot answers"), RefusedError(RefusalCode.NOT_ALLOWED, "no")])
+@pytest.mark.long
 def test_a_wait_ends_if_the_service_is_silent_and_not_if_it_refuses(error: Exception) -> None:
     checks: list[None] = []
 

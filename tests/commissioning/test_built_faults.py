@@ -21,6 +21,7 @@ OF_PARTS = ("B against", "A loose", "C slips 0.3", "B play 0.0003")
 
 @pytest.mark.generated(0, 1)
 @pytest.mark.parametrize("path", thinned(SIMULATED, every=3), ids=lambda path: path.stem)
+@pytest.mark.long
 def test_one_pass_corrects_the_file_and_the_next_finds_nothing(path: Path, seed: int, tmp_path: Path) -> None:
     chance = random.Random(f"{path.stem}{seed}")
     faults = chance.choice(TURNED).split("|")

@@ -774,7 +774,6 @@ SHARES = st.tuples(st.floats(-1.0, 1.0), st.floats(0.01, 2.0))
 @pytest.mark.parametrize("name", ["sim.toml", "uvw.toml", "uvw-ppr.toml", "xxy.toml"])
 @example(position=(0.1, 0.3), passive=(-0.08, 0.3), x=(0.0, 1.0), y=(0.0, 1.0), phi=(0.0, 1.0))
 @given(position=SHARES, passive=SHARES, x=SHARES, y=SHARES, phi=SHARES)
-@pytest.mark.many
 def test_limits_are_refused_exactly_if_no_pose_is_within_them(
     name: str,
     position: tuple[float, float],

@@ -242,6 +242,7 @@ def played(seed: int) -> Counter[str]:
     return kinds
 
 
+@pytest.mark.long
 def test_not_one_false_done_and_none_missing() -> None:
     kinds = played(0)
     assert all(kinds[kind] for kind in ("done", "done late", "unsettled", "preempted", "stopped", "passed")), kinds

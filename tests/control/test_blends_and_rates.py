@@ -17,7 +17,6 @@ from trirail.wire.vocabulary import Command, Mode, Stop
 
 @pytest.mark.parametrize("instant", [240, 270, 300, 330])
 @pytest.mark.parametrize("goal", [PoseGoal(0.1, 0.05, 0.2), PoseGoal(0.0, 0.0, 0.0), SlidersGoal((0.05, -0.03, 0.08))])
-@pytest.mark.many
 def test_a_goal_appended_while_the_robot_brakes_for_override_zero_breaks_no_limit(goal: Goal, instant: int) -> None:
     """The robot may still brake when it passes from one path to the other."""
     session = Session()
@@ -72,7 +71,6 @@ def rate(session: Session) -> float:
 
 @pytest.mark.parametrize("at", thinned([20, 40, 70, 100, 150, 250]))
 @pytest.mark.parametrize("override", [0.01, 0.05, 0.3, 0.8])
-@pytest.mark.many
 def test_a_lower_override_acts_as_quickly_as_a_pause(override: float, at: int) -> None:
     """While the robot accelerates, only a slow change fits at first, but not for long."""
 
@@ -163,7 +161,7 @@ def test_a_goal_keeps_its_own_limits_while_its_rate_changes(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("acceleration", "jerk", "share"), [(0.02, 0.05, 0.1), (0.02, 0.05, 0.4), (1.0, 10.0, 0.2)])
-@pytest.mark.many
+@pytest.mark.long
 def test_where_own_limits_are_used_completely_a_pause_is_soon(acceleration: float, jerk: float, share: float) -> None:
     assert_pauses_soon(acceleration, jerk, share)
 
@@ -254,7 +252,7 @@ def test_the_override_acts_again_when_the_goal_that_forbids_it_has_gone(how: str
 
 @pytest.mark.parametrize("every", [20, 100, 400])
 @pytest.mark.parametrize("override", thinned([0.01, 0.03, 0.05], every=3))
-@pytest.mark.many
+@pytest.mark.long
 def test_a_renewed_jog_moves_at_every_override(override: float, every: int) -> None:
     session = Session()
     session.order(Command.OVERRIDE, override)

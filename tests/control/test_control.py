@@ -466,7 +466,6 @@ def test_sliders_out_of_reach(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("velocity", [(0.25, 0.0, 0.0), (0.0, -0.2, 0.0), (0.0, 0.0, 1.0), (0.1, 0.1, -0.5)])
-@pytest.mark.many
 def test_a_jog_brakes_before_a_limit(rig: Rig, velocity: tuple[float, float, float]) -> None:
     rig.enable()
     for _ in range(100):

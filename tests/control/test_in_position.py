@@ -203,7 +203,6 @@ def test_unsettled_says_where_the_robot_is_and_holds(robots: Callable[..., Rig])
         ("fault", "faulted", Mode.FAULT),
     ],
 )
-@pytest.mark.many
 def test_what_ends_it(late: Rig, what: str | ModeEvent, outcome: str, mode: Mode) -> None:
     if isinstance(what, ModeEvent):
         late.control.modes.handle_disturbance(what, coded("it happened", EventCode.OTHER))
@@ -278,7 +277,6 @@ def test_a_blend_does_not_wait(behind: Rig) -> None:
 
 
 @pytest.mark.parametrize("later", range(9))
-@pytest.mark.many
 def test_a_goal_that_comes_as_the_path_ends_goes_on_from_a_blend(behind: Rig, later: int) -> None:
     """Neither is the one refused, nor the other preempted, at whatever cycle of the path's last ones it comes."""
     behind.send("g1", PoseGoal(*TARGET, blend=0.001))

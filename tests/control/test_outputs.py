@@ -240,7 +240,6 @@ def test_a_full_log_keeps_its_first_rows(rig: Rig) -> None:
 
 @pytest.mark.parametrize("kind", ROBOTS)
 @pytest.mark.generated(*range(25))
-@pytest.mark.many
 def test_in_sessions_of_goals_no_mark_switches_twice_or_after_its_goals_end(kind: str, seed: int) -> None:
     """Twenty random goals per session, that follow, blend into or preempt each other, or are stopped."""
     rng = np.random.default_rng(1000 + seed)

@@ -85,7 +85,6 @@ def go_through(seed: int, path: int, instant: int, first: str, delay: int, secon
 
 
 @pytest.mark.generated(*range(SAMPLE))
-@pytest.mark.many
 def test_two_events_at_any_instants_break_no_limit_and_turn_no_time_back(seed: int) -> None:
     chance = random.Random(seed)
     path = chance.randrange(len(PATHS))
@@ -103,14 +102,12 @@ def test_two_events_at_any_instants_break_no_limit_and_turn_no_time_back(seed: i
     ],
 )
 @pytest.mark.parametrize("path", range(len(PATHS)))
-@pytest.mark.many
 def test_what_once_ran_back_or_beyond_a_limit(path: int, instant: int, first: str, delay: int, second: str) -> None:
     go_through(1, path, instant, first, delay, second)
 
 
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("lower", [0.0, 0.2])
-@pytest.mark.many
 def test_raising_a_rate_that_is_still_falling_goes_on_along_the_path(lower: float, delay: int) -> None:
     """Seen from outside: on a straight line from rest the platform never goes back."""
     session = Session()

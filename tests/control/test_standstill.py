@@ -187,7 +187,6 @@ def end(session: QueueSession) -> None:
 
 
 @pytest.mark.generated(*range(240))
-@pytest.mark.many
 def test_no_two_events_move_a_robot_that_is_paused_or_holds(seed: int) -> None:
     chance = random.Random(seed)
     first, second = PAIRS[seed % len(PAIRS)] if seed < len(PAIRS) else chance.choice(PAIRS)
@@ -196,7 +195,6 @@ def test_no_two_events_move_a_robot_that_is_paused_or_holds(seed: int) -> None:
 
 @pytest.mark.parametrize("second", ["cancel the second", "cancel the third", "expiry", "stop", "override 150"])
 @pytest.mark.parametrize("delay", [0, 10, 300])
-@pytest.mark.many
 def test_a_pause_outlives_what_happens_to_the_goals_that_wait(second: str, delay: int) -> None:
     run_pair("pause", second, 100, delay)
 

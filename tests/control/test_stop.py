@@ -85,7 +85,6 @@ def circles(number: int, duration: float, radius: float) -> TrajectoryGoal:
 @pytest.mark.parametrize(
     ("goal", "cycles"), [(PoseGoal(0.1, 0.0, 0.0), 150), (circles(3000, 9.1, 0.015), 3640)], ids=["line", "circles"]
 )
-@pytest.mark.many
 def test_whoever_stops_again_and_again_delays_no_stop(goal: Goal, cycles: int, name: Command) -> None:
     """Nor does what changes nothing while the robot brakes. It takes cycles to find out how a long path is braked."""
     braked = []

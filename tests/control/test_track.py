@@ -90,6 +90,7 @@ def rig() -> ControlRig:
 
 
 @pytest.mark.parametrize("delay", [1, 3, 5])
+@pytest.mark.long
 def test_behind_a_sine_it_is_within_half_a_millimetre(rig: ControlRig, delay: int) -> None:
     """Whether the planner answers at once, in time, or so late that it has to be asked for more."""
     rig.enable()
@@ -182,7 +183,6 @@ def test_a_target_out_of_a_sliders_travel_is_waited_for_too(rig: ControlRig) -> 
 
 @pytest.mark.parametrize("timeout", [0.03, 0.05, 0.1])
 @pytest.mark.parametrize("speed", [0.05, 0.1, 0.2])
-@pytest.mark.many
 def test_before_the_border_every_report_of_a_target_is_accepted(rig: ControlRig, speed: float, timeout: float) -> None:
     """The robot may have to brake at once, for longer than the time-out of the track."""
     rig.enable()

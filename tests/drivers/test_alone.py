@@ -135,6 +135,7 @@ def test_one_drive_is_homed_alone() -> None:
         (["A swapped B"], (0.0, 2.0, 1.0)),
     ],
 )
+@pytest.mark.long
 def test_rules_read_where_sliders_really_are(rig: Rig, lines: list[str], rules: Triple) -> None:
     for line in lines:
         rig.bus.faults.add(line)

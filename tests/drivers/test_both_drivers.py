@@ -124,6 +124,7 @@ def test_a_drive_that_keeps_its_power_is_named_with_its_state(enabled: AnyRig, a
 
 
 @pytest.mark.parametrize("before", ["set-up", "disable"])
+@pytest.mark.long
 def test_a_drive_that_gets_power_by_itself_is_named_with_its_state(ready: AnyRig, before: str) -> None:
     if before == "disable":
         ready.enable()
@@ -169,6 +170,7 @@ def test_a_drive_that_is_left_out_and_has_power_for_a_moment_stops_no_other(read
 
 
 @pytest.mark.parametrize("every", [1, 40, 100, 150])
+@pytest.mark.long
 def test_resets_in_quick_succession_hide_no_fault_and_end_it_with_its_cause(enabled: AnyRig, every: int) -> None:
     end = enabled.keep_fault(1)
     enabled.devices[1].fail(0x3210)

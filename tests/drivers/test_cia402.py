@@ -526,6 +526,7 @@ class TestFaults:
         ready.enable()
 
     @given(stored=st.sets(st.sampled_from(STORABLE)), homes=st.booleans(), boots_late=st.integers(0, 40))
+    @pytest.mark.long
     def test_a_drive_whose_boot_up_message_is_lost_is_configured_again(
         self, stored: set[int], homes: bool, boots_late: int
     ) -> None:
@@ -591,6 +592,7 @@ class TestFaults:
 
     @pytest.mark.parametrize("told", [True, False], ids=["boot-up told", "boot-up lost"])
     @pytest.mark.parametrize("another", [True, False])
+    @pytest.mark.long
     def test_a_drive_that_falls_silent_after_it_has_left_operational_returns(
         self, enabled: Rig, told: bool, another: bool
     ) -> None:

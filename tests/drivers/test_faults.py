@@ -410,6 +410,7 @@ def test_the_pose_is_found_again_after_sliders_that_belong_to_none(rig: Cia402Ri
 
 @pytest.mark.parametrize("command", ["disable", "quick_stop"])
 @pytest.mark.parametrize("before", ["disable", "quick_stop"])
+@pytest.mark.long
 def test_a_drive_under_local_control_that_has_power_is_named_and_commands_are_answered(
     rig: Cia402Rig, before: str, command: str
 ) -> None:

@@ -27,7 +27,6 @@ ENDS = 4000
 
 @pytest.mark.parametrize("struck", [(1,), (0, 1, 2)], ids=["one", "all"])
 @pytest.mark.parametrize("name", MAKES)
-@pytest.mark.many
 def test_drives_that_restart_are_configured_again(closing: Closing, name: str, struck: tuple[int, ...]) -> None:
     """In motion; then a reset, power and motion follow, and no drive has had power in between."""
     rig = closing(Rig(name))

@@ -160,7 +160,6 @@ def test_only_what_is_not_absolute_is_homed(robots: Robots) -> None:
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("method", [19, 37])
 @pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
-@pytest.mark.many
 def test_one_moves_at_a_time_and_none_jumps(robots: Robots, delay: Delay | None, method: int, direction: int) -> None:
     robot = incremental(method)
     turned = msgspec.structs.replace(robot.drives.B, direction=direction)

@@ -348,7 +348,6 @@ def rig() -> Iterator[OdriveRig]:
     [tried(mode, case) for case in STOP for mode in case.modes if mode in NOT_HOMING],
     ids=lambda value: value.line if isinstance(value, Case) else value,
 )
-@pytest.mark.many
 def test_a_fault_stops_all_three_drives(rig: OdriveRig, case: Case, mode: str) -> None:
     begun = begin(rig, mode, case.line)
     assert_stops_until_reset(rig, case, begun)
@@ -381,7 +380,6 @@ GO_ON = [
 
 @pytest.mark.parametrize("mode", [*map(tried, NOT_HOMING)])
 @pytest.mark.parametrize("line", GO_ON)
-@pytest.mark.many
 def test_what_does_not_stop_the_robot(rig: OdriveRig, line: str, mode: str) -> None:
     begun = begin(rig, mode, line)
     assert_goes_on(rig, begun, 4 * BEAT)
@@ -418,7 +416,6 @@ def test_a_drive_that_keeps_its_power_stays_at_the_end_of_the_ramp_and_is_named(
 
 @pytest.mark.parametrize("mode", ["holding"])
 @pytest.mark.parametrize(("state", "lost"), [*((state, 0) for state in (*cansimple.PROCEDURES, 5)), (9, 1), (11, 3)])
-@pytest.mark.many
 def test_a_procedure_that_a_drive_begins_by_itself_stops_the_robot_and_is_ended(
     rig: OdriveRig, state: int, lost: int, mode: str
 ) -> None:
@@ -454,6 +451,7 @@ def test_a_drive_that_has_restarted_finishes_its_start_before_it_is_configured(r
 
 @pytest.mark.parametrize("mode", ["holding"])
 @pytest.mark.parametrize("command", ["disable", "quick_stop", "reset"])
+@pytest.mark.long
 def test_a_drive_that_does_not_end_its_procedure_is_named_and_commands_are_answered(
     rig: OdriveRig, command: str, mode: str
 ) -> None:

@@ -147,7 +147,7 @@ def test_no_drive_is_configured_while_another_still_brakes_because_of_its_fault(
 
 
 @pytest.mark.parametrize("after", [0, 60, 150])
-@pytest.mark.many
+@pytest.mark.long
 def test_an_error_that_begins_during_the_set_up_of_a_returning_drive_is_reported_until_it_ends(
     rig: RecoveryRig, after: int
 ) -> None:
@@ -262,6 +262,7 @@ SCALING: dict[tuple[int, int], tuple[int, int, int, str]] = {
 
 
 @pytest.mark.parametrize("key", SCALING, ids=lambda key: f"{key[0]:04X}:{key[1]}")
+@pytest.mark.long
 def test_a_drive_that_lost_its_direction_or_scale_is_refused_until_it_is_as_it_was(
     rig: RecoveryRig, key: tuple[int, int]
 ) -> None:
@@ -421,6 +422,7 @@ def test_an_odrive_whose_position_is_relative_is_not_homed_after_a_restart() -> 
 
 
 @pytest.mark.parametrize("line", ["A silent for 0.2", "A silent for 2", "bus-off for 0.4"])
+@pytest.mark.long
 def test_an_odrive_whose_position_is_relative_is_not_homed_after_silence(line: str) -> None:
     """It may have lost its supply, and have booted before it was heard again."""
     rig = relative_rig()
@@ -558,7 +560,6 @@ class AbsentRig(RecoveryRig):
 
 @either
 @pytest.mark.parametrize(("absent", "queue"), [((0, 1, 2), 10), ((0, 1, 2), 0), ((1,), 10), ((0, 2), 10)])
-@pytest.mark.many
 def test_a_service_that_starts_without_drives_configures_them_when_they_appear(
     absent: tuple[int, ...], queue: int, config: Config
 ) -> None:

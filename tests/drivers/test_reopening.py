@@ -343,7 +343,7 @@ def test_an_opening_that_hangs_holds_up_no_cycle(way: str) -> None:
 
 @pytest.mark.parametrize("config", [REAL, odrives()], ids=["cia402", "odrive"])
 @pytest.mark.generated(0, 1)
-@pytest.mark.many
+@pytest.mark.long
 def test_a_service_that_starts_without_a_bus_uses_it_when_it_appears(way: str, config: Config, seed: int) -> None:
     draw = random.Random(seed)
     rig = BusRig(way, config, absent='there is no CAN interface "can0"; bring it up')

@@ -51,7 +51,7 @@ def test_the_figures_are_the_papers() -> None:
 
 
 @pytest.mark.parametrize("name", [*PANELS, "paper"])
-@pytest.mark.many
+@pytest.mark.long
 def test_every_picture_shows_all_three_sliders(pictures: dict[str, Path], name: str) -> None:
     """Also where their curves coincide; the legends alone would not fill so many pixels."""
     image = imread(pictures[name])

@@ -332,7 +332,6 @@ def test_the_queue_has_an_end(rig: ControlRig) -> None:
 
 @pytest.mark.parametrize("name", ["stop", "pause", "quick_stop"])
 @pytest.mark.parametrize("wait", [20, 150, 260])
-@pytest.mark.many
 def test_a_queue_is_stopped_or_paused_as_a_whole(rig: ControlRig, name: str, wait: int) -> None:
     rig.enable()
     for number, pose in enumerate(SQUARE):

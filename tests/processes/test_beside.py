@@ -108,7 +108,6 @@ def replayed(config: Config, records: NDArray[np.void], inputs: list[ControlInpu
         ("stops", 1),
     ],
 )
-@pytest.mark.many
 def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last_bit(
     protocol: str, seed: int, number: int, tmp_path: Path
 ) -> None:
@@ -136,7 +135,7 @@ def test_a_session_with_every_decision_beside_its_cycles_is_replayed_to_the_last
 
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.parametrize("rate", [20, 50, 100, 250])
-@pytest.mark.many
+@pytest.mark.long
 def test_cycles_beside_a_decision_are_recorded_at_a_rate_at_which_a_batch_has_few_records(
     rate: int, number: int, tmp_path: Path
 ) -> None:
@@ -185,7 +184,6 @@ MISHAPS: dict[str, Callable[[Session, random.Random], None]] = {
 @pytest.mark.parametrize("number", thinned([2, 1]))
 @pytest.mark.parametrize("mishap", MISHAPS)
 @pytest.mark.generated(1, 2)
-@pytest.mark.many
 def test_what_happens_beside_a_decision_is_handled_in_its_cycle(
     mishap: str, number: int, seed: int, tmp_path: Path
 ) -> None:
@@ -326,7 +324,6 @@ def ramping(what: Callable[[Session], None], later: int) -> dict[int, list[Happe
 @pytest.mark.parametrize("what", DUE)
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.generated(1, 2)
-@pytest.mark.many
 def test_what_must_not_wait_does_not_although_a_decision_is_due_in_every_cycle(
     seed: int, number: int, what: str, tmp_path: Path
 ) -> None:

@@ -416,7 +416,6 @@ def both_ways(
         *((carrier, protocol, 3) for carrier in CARRIERS[1:] for protocol in CONFIGS),
     ],
 )
-@pytest.mark.many
 def test_compiled_cycles_are_those_of_python_to_the_last_bit(
     carrier: str, protocol: str, seed: int, tmp_path: Path
 ) -> None:
@@ -454,7 +453,6 @@ def test_cycles_at_the_highest_rate_are_those_of_python(seed: int, tmp_path: Pat
 @pytest.mark.parametrize("carrier", CARRIERS)
 @pytest.mark.parametrize("unread", [False, True])
 @pytest.mark.parametrize("moving", [False, True])
-@pytest.mark.many
 def test_a_bus_that_dies_is_a_fault_in_the_same_cycle(moving: bool, unread: bool, carrier: str, tmp_path: Path) -> None:
     """The kernel tells of a broken socket once: who hears of it hands it on."""
 
@@ -497,7 +495,7 @@ def moves() -> dict[int, list[Happening]]:
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("protocol", CONFIGS)
-@pytest.mark.many
+@pytest.mark.long
 def test_frames_that_a_full_bus_refuses_are_lost_alone(protocol: str, seed: int, tmp_path: Path) -> None:
     """Whichever they are, the others go on, and it is told of."""
     chance, happens = random.Random(seed), moves()
@@ -513,7 +511,6 @@ def test_frames_that_a_full_bus_refuses_are_lost_alone(protocol: str, seed: int,
 
 @pytest.mark.parametrize("room", range(8))
 @pytest.mark.parametrize("protocol", CONFIGS)
-@pytest.mark.many
 def test_a_socket_that_is_full_within_a_cycle_loses_its_last_frames(protocol: str, room: int, tmp_path: Path) -> None:
     happens = moves()
     for number in range(101, 450, 9):
@@ -526,7 +523,6 @@ def test_a_socket_that_is_full_within_a_cycle_loses_its_last_frames(protocol: st
     ("protocol", "identifier"),
     [case for protocol in CONFIGS for case in thinned(((protocol, each) for each in SENT[protocol]), every=3)],
 )
-@pytest.mark.many
 def test_a_frame_that_is_refused_for_good_stops_the_drives_in_the_same_cycle(
     protocol: str, identifier: int, tmp_path: Path
 ) -> None:
@@ -572,7 +568,6 @@ def test_what_the_last_gate_refuses_is_a_fault_in_the_same_cycle(protocol: str, 
 
 @pytest.mark.parametrize("protocol", CONFIGS)
 @pytest.mark.parametrize(("often", "found"), [(37, None), (1, "a second node with id 1 on the bus")])
-@pytest.mark.many
 def test_a_position_that_comes_twice_is_a_second_nodes_only_if_it_does_so_often(
     protocol: str, often: int, found: str | None, tmp_path: Path
 ) -> None:

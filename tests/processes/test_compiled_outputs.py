@@ -70,7 +70,6 @@ def words(session: Session, index: int) -> list[int]:
 
 
 @pytest.mark.parametrize(("carrier", "seed"), [*(("unix", seed) for seed in range(4)), ("captured", 1), ("virtual", 2)])
-@pytest.mark.many
 def test_outputs_and_inputs_are_those_of_python_to_the_last_bit(carrier: str, seed: int, tmp_path: Path) -> None:
     one = both_ways(PINS, tmp_path, partial(session, seed), CYCLES, carrier)
     assert len(words(one, 0)) > 10
@@ -101,7 +100,6 @@ def test_outputs_that_a_full_bus_refuses_come_in_a_later_cycle(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("room", range(1, 9))
-@pytest.mark.many
 def test_a_socket_that_is_full_within_a_cycle_keeps_outputs_for_the_next(room: int, tmp_path: Path) -> None:
     happens = session(3)
     for number in range(101, 450, 9):

@@ -175,7 +175,6 @@ def test_how_a_child_ends_is_told_and_another_takes_its_place(does: str, how: st
 @pytest.mark.parametrize("call", ["fork", "pidfd_open"])
 @pytest.mark.parametrize("name", ["gateway", "loop"])
 @pytest.mark.parametrize("kept", [True, False])
-@pytest.mark.many
 def test_a_child_that_cannot_be_forked_is_told_with_the_reason_and_another_can(
     call: str, name: str, kept: bool, parent: Parent
 ) -> None:
@@ -264,6 +263,7 @@ def test_a_dead_parent_is_told_and_so_are_its_children(parent: Parent) -> None:
     assert parent.child("gateway").returncode == EXIT_CODE_UNKNOWN
 
 
+@pytest.mark.long
 def test_how_a_child_ended_is_told_also_where_its_parent_is_importing(parent: Parent) -> None:
     gateway = parent.child("gateway")
     parent.until_said(gateway)
@@ -286,6 +286,7 @@ def test_a_frozen_parent_is_waited_for_once(parent: Parent, monkeypatch: pytest.
         assert parent.until_over(child) == "exit code unknown"
 
 
+@pytest.mark.long
 def test_a_parent_that_was_late_once_is_waited_for_again(parent: Parent) -> None:
     late = "if os.fork() == 0: time.sleep({}); os.kill(server, signal.SIGCONT); os._exit(0)\n"
     late += "os.kill(server, signal.SIGSTOP); os._exit(7)"

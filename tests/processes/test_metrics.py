@@ -356,6 +356,7 @@ def client_hello() -> bytes:
 
 
 @pytest.mark.parametrize("content", [b"GET /metrics" + 200 * b"x", b"GET / HTTP/1.1\r\n" + 30 * b"X: a\r\n"])
+@pytest.mark.long
 def test_connections_that_say_little_at_a_time_keep_nobody_out(
     local: tuple[str, Health], monkeypatch: pytest.MonkeyPatch, content: bytes
 ) -> None:
@@ -408,6 +409,7 @@ def test_beyond_the_loopback_nobody_reads_them_without_a_good_certificate(
     assert get(f"{url}/metrics", shown(folder, "eva"))[0] == 200
 
 
+@pytest.mark.long
 def test_handshakes_that_say_little_at_a_time_keep_nobody_out(
     beyond: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

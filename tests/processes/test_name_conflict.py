@@ -136,6 +136,7 @@ def test_neither_of_two_services_of_one_name_moves_but_both_stop(
     assert [request.user for request in first.link.sent if isinstance(request, GoalRequest)] == ["ann"]
 
 
+@pytest.mark.long
 def test_a_run_that_vanishes_soon_is_not_reported(tmp_path: Path, router: Router, first: Service) -> None:
     second = Service(tmp_path, router.locator, "second")
     wait_until(second.knows)
@@ -150,6 +151,7 @@ def test_a_run_that_vanishes_soon_is_not_reported(tmp_path: Path, router: Router
     second.end()
 
 
+@pytest.mark.long
 def test_a_restarted_gateway_and_a_robot_of_another_name_do_not_disturb(
     tmp_path: Path, router: Router, first: Service
 ) -> None:
@@ -166,6 +168,7 @@ def test_a_restarted_gateway_and_a_robot_of_another_name_do_not_disturb(
     other.end()
 
 
+@pytest.mark.long
 def test_it_is_known_again_after_the_router_has_restarted(tmp_path: Path, router: Router, first: Service) -> None:
     second = Service(tmp_path, router.locator, "second")
     for service in (first, second):

@@ -52,6 +52,7 @@ def robot(service: Service) -> Iterator[Robot]:
         yield robot
 
 
+@pytest.mark.long
 def test_outputs_are_set_by_client_and_command_line(service: Service, robot: Robot) -> None:
     assert (robot.info().outputs, robot.info().inputs) == (("valve", "lamp"), ("part",))
     robot.set_output("valve", True)
@@ -113,6 +114,7 @@ def test_a_goal_tells_its_switches_and_they_are_in_the_recording(
     assert np.isin(goal.id, np.load(path)["goal"])
 
 
+@pytest.mark.long
 def test_marks_that_cannot_be_are_refused_and_nothing_moves(robot: Robot) -> None:
     before = robot.state().commanded.position
     for marks, what in (
@@ -124,6 +126,7 @@ def test_marks_that_cannot_be_are_refused_and_nothing_moves(robot: Robot) -> Non
     assert robot.state().commanded.position == before
 
 
+@pytest.mark.long
 def test_outputs_are_safe_at_the_end_of_the_service(service: Service, robot: Robot) -> None:
     robot.set_output("valve", True)
     until(robot, lambda state: state.outputs["valve"])

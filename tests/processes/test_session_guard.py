@@ -344,6 +344,7 @@ OTHER, GROUP = 65_534, 54_321
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+@pytest.mark.long
 def test_a_socket_lets_its_owner_and_group_in_and_nobody_else(tmp_path: Path) -> None:
     for folder in (tmp_path, *tmp_path.parents):
         if folder.stat().st_uid == os.getuid() and folder.is_relative_to("/tmp/") and folder != Path("/tmp"):

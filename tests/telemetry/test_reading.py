@@ -129,6 +129,7 @@ def test_a_file_that_was_never_closed_holds_all_that_was_written(tmp_path: Path)
         recorder.close()
 
 
+@pytest.mark.long
 def test_a_killed_recorder_leaves_what_it_has_written(tmp_path: Path) -> None:
     script = (
         "import os, signal, sys; from pathlib import Path; import made; from telemetry.test_reading import written\n"
@@ -141,6 +142,7 @@ def test_a_killed_recorder_leaves_what_it_has_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.77, 0.9, 1.0 - 1e-6])
+@pytest.mark.long
 def test_wherever_a_file_is_cut_the_records_before_are_read(tmp_path: Path, share: float) -> None:
     sent = made.records(2.0)
     written(tmp_path / "whole.rrd", sent)
@@ -164,6 +166,7 @@ def test_a_file_that_ends_with_a_whole_message_is_read_where_it_is(
         recorder.close()
 
 
+@pytest.mark.long
 def test_every_length_of_the_last_message_is_survived(tmp_path: Path) -> None:
     recorder = written(tmp_path / "a.rrd", made.records(0.2), close=False)
     before = (tmp_path / "a.rrd").read_bytes()
@@ -180,6 +183,7 @@ def test_every_length_of_the_last_message_is_survived(tmp_path: Path) -> None:
 
 @settings(max_examples=40)
 @given(data=st.data(), cut=st.integers(0, 3 << 20), unaligned=st.booleans())
+@pytest.mark.long
 def test_an_end_of_nul_bytes_leaves_the_records_before_it(
     file_left_open: bytes, data: st.DataObject, cut: int, unaligned: bool
 ) -> None:

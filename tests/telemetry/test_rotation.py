@@ -502,6 +502,7 @@ def test_after_a_disk_that_failed_the_recording_goes_on_in_another_file(tmp_path
     assert read(others[-1]).records["cycle"][-1] == 3999
 
 
+@pytest.mark.long
 def test_a_killed_recorder_leaves_all_that_was_saved(tmp_path: Path) -> None:
     script = (
         "import os, signal, sys; from pathlib import Path; import made, telemetry.test_rotation as here\n"

@@ -137,6 +137,7 @@ def test_the_second_robot_has_another_rate_a_drive_to_home_and_one_that_others_m
         bus.faults.load(tmp_path / "second.faults")
 
 
+@pytest.mark.long
 def test_the_foreign_drive_says_its_units_and_what_it_lacks() -> None:
     """On a bus of this process: the driver's own thread is this one, the drive's another."""
     counts, turns = hil_second.COUNTS, hil_second.REVOLUTIONS

@@ -84,6 +84,7 @@ print(dict(ends))
 """
 
 
+@pytest.mark.long
 def test_no_thread_that_decodes_a_type_for_the_first_time_ends_the_interpreter() -> None:
     children = 100
     program = [sys.executable, "-c", FIRST_DECODES, str(children)]

@@ -389,6 +389,7 @@ def test_a_narrow_window_of_phi_is_found(robot: Geometry, middle: float, half: f
 
 
 @pytest.mark.parametrize("robot", [PAPER, as_built(1, 0.01)])
+@pytest.mark.long
 def test_the_volume_by_chance(robot: Geometry) -> None:
     """Poses drawn at random in a box around the window, against the joints' limits."""
     found = measure_extent(robot, LIMITS, permitted_slice)
