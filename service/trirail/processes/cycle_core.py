@@ -436,12 +436,13 @@ def copy_state(copies: NDArray[np.int64], back: bool) -> None:
 
 @compiled()
 def _rehearse(state: NDArray[np.void], moment: NDArray[np.int64], motion: MotionArrays, rehearsal: Rehearsal) -> None:
-    """Compute the next setpoints on copies, if there is time before the tick; this moves code and data to the caches.
+    """Compute the next setpoints on copies, if there is twice as much time before the tick as that took last.
 
-    The setpoints are then sent 1.6 µs earlier on a processor with 12 µs from the tick to the setpoints.
+    Code and data are then in the processor's caches when the setpoints are computed behind the SYNC.
     """
-    s = state[0]
-    if s.injected_ns < 0 and now_ns(moment) > s.deadline_ns - s.busy_wait_ns // 3:
+    s, began = state[0], now_ns(moment)
+    if s.injected_ns < 0 and began + 2 * s.rehearsal_ns > s.deadline_ns:
+        s.rehearsal_ns -= s.rehearsal_ns // 64  # after a single delay, rehearsals begin again
         return
     copy_state(rehearsal.copies, False)
     rehearsal.state[0].synced = _now_ns(state, moment) / 1e9
@@ -449,6 +450,7 @@ def _rehearse(state: NDArray[np.void], moment: NDArray[np.int64], motion: Motion
         *(motion.knots, motion.pieces, motion.tools, motion.law_knots, motion.law_pieces, rehearsal.furthest)
     )
     solve(rehearsal.state, moment, rehearsal.frames, rehearsal.robot, copied)
+    s.rehearsal_ns = now_ns(moment) - began
 
 
 @compiled()

@@ -32,6 +32,8 @@ class CycleState(ctypes.Structure):
     """Time of an injected clock in tests; negative to use the monotonic clock."""
     busy_wait_ns: int
     """Time before each deadline at which the loop wakes up."""
+    rehearsal_ns: int
+    """Duration of the newest rehearsal of a cycle, or less if it was too long for the next."""
     deadline_ns: int
     """Time at which the newest tick was due."""
     lateness_ns: int
