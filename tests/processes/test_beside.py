@@ -470,6 +470,43 @@ def test_an_edge_from_before_the_start_of_a_goal_does_not_end_it(tmp_path: Path)
 
 
 @pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("follower_ends_there", [False, True])
+def test_an_edge_in_the_last_cycles_of_a_goal_stops_the_robot_also_where_it_passes_on(
+    number: int, follower_ends_there: bool, tmp_path: Path
+) -> None:
+    """It is noticed beside the decision that passes on to the next goal."""
+    config = structs.replace(CONFIGS["cia402"], inputs=INPUTS)
+    session = Session(config, tmp_path, "unix", compiled=True)
+    caller = caller_of(session)
+    caller.cycles_beside = number, number
+    decide = caller._answer
+
+    def press_at_passage() -> None:
+        goals = [goal.id for goal in session.loop.control.ledger.goals]
+        decide()
+        if goals == ["first", "second"] and session.loop.control.ledger.goals[0].id == "second":
+            session.drives.press(1, 1 << INPUTS["part"].bit)
+
+    caller._answer = press_at_passage  # type: ignore[method-assign]
+    edge = StopAt("part", "rising")
+    first = PoseGoal(0.03, 0.0, 0.0, blend=0.005, speed=0.3, stop_at=edge)
+    second = PoseGoal(0.03, 0.05, 0.0, blend=0.005, speed=0.3, stop_at=edge if follower_ends_there else None)
+    happens = {
+        30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+        150: [Happening(lambda session: session.ask(GoalRequest(2, "ann", "first", first, 0)))],
+        170: [Happening(lambda session: session.ask(GoalRequest(3, "ann", "second", second, 0)))],
+    }
+    try:
+        records, inputs, events = recorded(session, happens, 1500)
+    finally:
+        session.close()
+    told = [each.event.message for each in events if each.event.outcome is not None]
+    assert told == ["goal first done: passed on the way to goal second", "goal second stopped: input part rising"]
+    assert np.abs(records["commanded_pose"][-1] - (0.03, 0.05, 0.0)).max() > 0.04
+    assert not replayed(config, records, inputs).any()
+
+
+@pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.generated(4125785050, 0, 1, 2, 3)
 def test_outputs_switch_as_without_cycles_beside_decisions(seed: int, number: int, tmp_path: Path) -> None:
     session = Session(PINS, tmp_path, "unix", compiled=True)

@@ -134,11 +134,13 @@ class Starter:
         self._process: int | None = None
         self.gone = False
         """True if the process had ended before the service started."""
-        if number := os.environ.pop(STARTER, ""):
-            try:
-                self._process = os.pidfd_open(int(number))
-            except ProcessLookupError:
-                self.gone = True
+        number = os.environ.pop(STARTER, "")
+        try:
+            self._process = os.pidfd_open(int(number)) if number else None
+        except ProcessLookupError:
+            self.gone = True
+        except OSError:
+            pass  # a kernel that has no file descriptors of processes
 
     def has_ended(self) -> bool:
         """Return True if there was such a process, and it has ended."""
