@@ -125,6 +125,21 @@ def test_sliders_are_reported_without_the_backlash_compensation(monkeypatch: pyt
     assert summaries[1].distance == pytest.approx(summaries[0].distance)
 
 
+def test_a_place_that_is_not_known_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before homing, the position of a slider is relative to where its drive was switched on."""
+    records = made.records(2.0)
+    records["homed"], records["homed"][:100, 1] = 1, 0
+    drawn: dict[str, Any] = {}
+    monkeypatch.setattr(charts, "_draw_curves", lambda panel, _, values, __: drawn.update({panel: values}))
+    monkeypatch.setattr(charts, "_label_curves", lambda *_: None)
+    panels: Any = {name: name for name in ("x, y [mm]", "φ [°]", "λ [mm]", "velocity [mm/s]", "error [µm]")}
+    charts._draw_motion(panels, records, np.arange(len(records)) / made.RATE_HZ, None, ("A", "B", "C"))
+    for panel in ("x, y [mm]", "φ [°]"):
+        assert np.isnan(drawn[panel][:100]).all()
+        assert np.isfinite(drawn[panel][100:]).all()
+    assert np.isnan(drawn["λ [mm]"]).sum(axis=0).tolist() == [0, 100, 0]
+
+
 @pytest.mark.generated(0, 1, 2)
 def test_no_excursion_of_a_long_curve_is_lost(seed: int) -> None:
     """Neither the last one of the session, nor one right before a fault, since when there are no values."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import subprocess
+import sys
 from pathlib import Path
 
 import made
@@ -172,6 +174,24 @@ def test_what_cannot_be_written_to_the_end_leaves_no_file(
             write(recording, path)
     assert [*tmp_path.iterdir()] == []
     assert write(recording, path) > 0
+
+
+def test_what_a_full_disk_refuses_at_the_very_end_leaves_no_file(tmp_path: Path) -> None:
+    """The last bytes are written when the file is closed; numpy writes to a descriptor itself, and hides errors."""
+    limit = (
+        "import contextlib, resource, signal; from pathlib import Path\n"
+        "from trirail.errors import ServiceError\n"
+        "from trirail.analysis.new_file import new_file\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+        f"path = Path({str(tmp_path)!r})\n"
+        "with contextlib.suppress(ServiceError), new_file(path / 'table.csv') as file: file.write(bytes(200))\n"
+        "from trirail.analysis import export; import pyarrow as pa\n"
+        "export._write(path / 'table.npy', lambda: pa.table({'a': list(range(20))}))\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", limit], capture_output=True, text=True, check=False)
+    assert "ServiceError: cannot write" in ended.stderr
+    assert [*tmp_path.iterdir()] == []
 
 
 @given(

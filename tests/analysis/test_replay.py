@@ -232,6 +232,15 @@ def test_what_begins_in_motion_is_refused(recording: Recording, config: Config) 
         replay_session(late, config, simulated=False)
 
 
+def test_what_begins_after_the_first_inputs_is_refused_also_where_the_robot_is_disabled(
+    recording: Recording, config: Config
+) -> None:
+    """Nobody knows the override, or the place that was commanded last."""
+    later = recording._replace(requests=recording.requests[1:])
+    with pytest.raises(ServiceError, match=r"with input 2 of the control; a replay needs .* the first input"):
+        replay_session(later, config, simulated=False)
+
+
 def test_another_rate_is_refused(recording: Recording, config: Config) -> None:
     slower = msgspec.structs.replace(config, loop=msgspec.structs.replace(config.loop, rate_hz=500))
     with pytest.raises(ServiceError, match="500 Hz, but the recording has 1000 cycles per second"):

@@ -196,6 +196,14 @@ def test_an_error_of_the_operating_system_is_one_line_with_the_file_and_the_reas
         assert (out + err).count("\n") == 1
 
 
+@pytest.mark.parametrize("name", ["", ".", "..", "/"])
+@pytest.mark.parametrize("command", ["view", "report", "replay", "export", "run", "follow"])
+def test_a_folder_in_the_place_of_a_file_is_an_error_in_one_line(command: str, name: str, run: Run) -> None:
+    """Such as the empty value of a variable of the shell."""
+    code, out, err = run(command, name)
+    assert (code, out, err.count("\n")) == (1, "", 1), err
+
+
 def test_a_folder_that_cannot_be_read_is_not_an_empty_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:

@@ -166,6 +166,24 @@ def test_outputs_are_repeated_since_a_frame_may_be_lost(rig: Rig, lost: int) -> 
     assert rig.sent_to(canopen_frames.RPDO3)[0] == [canopen_frames.OUTPUTS.pack(VALVE)] * (1 + OUTPUT_REPEATS)
 
 
+@pytest.mark.parametrize("cycles", range(3, 8))
+def test_outputs_reach_a_drive_that_hears_nothing_for_fewer_cycles_than_are_a_fault(cycles: int) -> None:
+    rig = Rig(msgspec.structs.replace(CONFIG, missed_positions=10), IO)
+    try:
+        device = ready(rig).devices[0]
+        device.silent = True
+        rig.drives.set_outputs((VALVE, 0, 0))
+        rig.cycles(cycles)
+        device.silent = False
+        rig.cycles(OUTPUT_REPEATS + 3)
+        assert device.pins.bits == VALVE
+        rig.bus.sent.clear()
+        rig.cycles(5)
+        assert outputs_sent(rig) == [[], [], []]
+    finally:
+        rig.drives.close()
+
+
 def test_only_named_bits_are_ever_sent(rig: Rig) -> None:
     ready(rig)
     rig.drives.set_outputs((0xFFFF_FFFF, 0xFFFF_FFFF, 1))
@@ -267,6 +285,19 @@ def test_inputs_come_masked_with_the_statusword(rig: Rig) -> None:
     assert rig.cycles(2).inputs == (0, 0, 0)
     rig.bus.press(2, PART)
     assert rig.cycles(2).inputs == (0, 0, 0), "C has no inputs that the robot uses"
+
+
+@pytest.mark.parametrize("before", [0, PART])
+@pytest.mark.parametrize("reads", ["cycle", "observe"])
+def test_a_pulse_of_an_input_that_is_shorter_than_a_cycle_has_two_edges(rig: Rig, before: int, reads: str) -> None:
+    rig.bus.press(1, before)
+    ready(rig)
+    rig.cycles(3)
+    for pressed in (PART - before, before):
+        rig.bus.press(1, pressed)
+        rig.bus._exchange.poll(rig.clock.now)  # the drive sends its PDO
+    seen = [(rig.cycle() if reads == "cycle" else rig.drives.observe()).inputs[1] for _ in range(4)]
+    assert seen in ([PART - before, before, before, before], [before, PART - before, before, before])
 
 
 def test_an_input_that_bounces_has_more_edges_than_one(rig: Rig) -> None:
@@ -414,7 +445,6 @@ def test_outputs_of_others_switch_in_their_cycle(closing: Closing, name: str) ->
     assert {node.value(0x60FE, 1) & io.outputs for node in rig.nodes} == {LAMP}
     if rig.nodes[0].has(0x60FE, 2):
         assert {node.value(0x60FE, 2) for node in rig.nodes} == {io.outputs}
-    kept = [node.value(0x60FE, 1) & ~io.outputs & -rig.nodes[0].has(0x60FE, 2) for node in rig.nodes]
     rig.enable()
     written = [(LAMP, LAMP, LAMP)] * 2
     for _ in range(200):
@@ -436,6 +466,7 @@ def test_outputs_of_others_switch_in_their_cycle(closing: Closing, name: str) ->
     rig.cycles(3, rig.target)
     assert tuple(node.value(0x60FE, 1) & io.outputs for node in rig.nodes) == written[-1]
     assert rig.cycle(rig.target).inputs == tuple(value & PART for value in inputs)
+    kept = [node.value(0x60FE, 1) & ~io.outputs & -rig.nodes[0].has(0x60FE, 2) for node in rig.nodes]
     assert kept == [0, 0, 0]
 
 

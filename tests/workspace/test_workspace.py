@@ -388,6 +388,18 @@ def test_a_narrow_window_of_phi_is_found(robot: Geometry, middle: float, half: f
     assert_allclose(measure_extent(robot, limits, permitted_slice).phi, phi, atol=1e-9)
 
 
+@pytest.mark.parametrize("travel", [1e-2, 1e-3, 1e-4, 5e-5])
+@pytest.mark.parametrize("phi", [(-0.05, 0.1), (-1.2, 0.85), (-0.01, 0.02)])
+def test_the_range_that_short_sliders_allow_is_found(travel: float, phi: tuple[float, float]) -> None:
+    """It is narrower than the samples between the limits of the platform."""
+    config = load(SIM)
+    sliders = msgspec.structs.replace(config.limits.slider, position=(-travel, travel), passive=(-travel, travel))
+    platform = msgspec.structs.replace(config.limits.platform, phi=phi)
+    limits = msgspec.structs.replace(config.limits, slider=sliders, platform=platform)
+    low, high = measure_extent(corrected_geometry(config), limits, permitted_slice).phi
+    assert low < 0.0 < high
+
+
 @pytest.mark.parametrize("robot", [PAPER, as_built(1, 0.01)])
 @pytest.mark.long
 def test_the_volume_by_chance(robot: Geometry) -> None:

@@ -53,6 +53,11 @@ _ENABLED_OR_ENABLING = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, P
 class Cia402Axis(Axis):
     """Newest feedback of one drive. Each `on_` method handles the data of one frame, and may raise struct.error."""
 
+    _received_inputs = 0
+    """Newest digital inputs."""
+    _changed_inputs = 0
+    """Inputs whose change will be in the next feedback; their later changes will be in the feedback after it."""
+
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
         self.set_up(
@@ -213,6 +218,7 @@ class Cia402Axis(Axis):
             (settled and no_fault and lives and quiet and not asked)
             and (self.cyclic and self.follows and self.holds is None and self.has_setpoint)
             and self.missed < self.missed_limit
+            and self.inputs == self._received_inputs
             and self._followed == follows
             and self.controlword == self.word(-math.inf, wanted)
             and not self.is_not_followed(self.controlword, wanted)
@@ -304,7 +310,26 @@ class Cia402Axis(Axis):
     def on_inputs(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """Handle TPDO3, sent on change and every STATUS_PERIOD: the digital inputs."""
         (inputs,) = canopen_frames.INPUTS.unpack(data)
-        self.inputs = inputs & self.io.inputs
+        self.update_inputs()
+        self._received_inputs = inputs & self.io.inputs
+        self.update_inputs()
+
+    def start_inputs(self, inputs: int) -> None:
+        """Set the digital inputs at the end of a set-up."""
+        self.inputs = self._received_inputs = inputs & self.io.inputs
+
+    def note_feedback(self) -> None:
+        """Note that a feedback contains the inputs."""
+        self._changed_inputs = 0
+
+    def update_inputs(self) -> None:
+        """Update the inputs by the received ones, except for those that have already changed since the last feedback.
+
+        A pulse shorter than a cycle is then in two feedbacks, and has two edges.
+        """
+        before, kept = self.inputs, self._changed_inputs
+        self.inputs = (before & kept) | (self._received_inputs & ~kept)
+        self._changed_inputs |= before ^ self.inputs
 
     def _on_statusword(self, data: bytes | bytearray, now: float) -> None:
         (statusword,) = canopen_frames.STATUSWORD.unpack(data)
@@ -326,12 +351,13 @@ class Cia402Axis(Axis):
         self.state = state
 
     def end_cycle(self) -> DriveFault | None:
-        """Check whether this cycle's frames came from two nodes with the same id.
+        """Check whether this cycle's frames came from two nodes with the same id, and update the inputs.
 
         A single node answers each SYNC once, and only while it is operational. Return a fault that was attributed to
         this drive although the second node caused it, otherwise None; the fault in `event` then reports the second
         node.
         """
+        self.update_inputs()
         mistaken = self._answers_after.end_cycle(came=self.came)
         if self._answers_per_sync.from_two_nodes():
             self.note_fault("frame", 0, warning(self.node, "each SYNC has two positions"))

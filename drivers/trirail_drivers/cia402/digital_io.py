@@ -29,9 +29,11 @@ async def configure_outputs(drive: Differences, io: DigitalIo) -> int:
         drive.lack(OUTPUTS, "it has no such object")
     current = await remote.peek(*OUTPUTS)
     has_mask = await remote.has(*MASK)
-    kept = 0 if has_mask else (current or 0) & ~io.outputs
-    # The safe values are written before the mask, since they take effect as soon as the new mask is written.
-    await _write(drive, OUTPUTS, kept | io.safe, io.outputs, "safe values")
+    others = (current or 0) & ~io.outputs
+    kept = 0 if has_mask else others
+    # The safe values are written before the mask, since they take effect as soon as the new mask is written. Until
+    # then, the old mask may enable other outputs, such as a brake.
+    await _write(drive, OUTPUTS, others | io.safe, io.outputs, "safe values")
     if has_mask:
         await _write(drive, MASK, io.outputs, 0xFFFF_FFFF, "the named outputs, and no others")
     held, _ = await remote.wait_until(OUTPUTS, lambda value: not (value ^ io.safe) & io.outputs)

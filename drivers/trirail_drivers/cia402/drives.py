@@ -150,7 +150,7 @@ class Cia402(Driver[Cia402Axis]):
         """Store the state that a drive had at the end of its set-up, and handle its frames from now on."""
         self._listen(axis)
         axis.update_position(start.counts)
-        axis.inputs = start.inputs & axis.io.inputs
+        axis.start_inputs(start.inputs)
         axis.update_status(start.statusword, axis.status_heard)
         axis.start_error(start.error_code, in_error=start.in_error)
         if start.in_error and not axis.error_code:
@@ -256,6 +256,8 @@ class Cia402(Driver[Cia402Axis]):
         """
         now = self._clock()
         self._wire.receive(now)
+        for axis in self._axes:
+            axis.update_inputs()
         self._ask_for_statuswords(self._axes)
         return self._feedback()
 
@@ -270,6 +272,8 @@ class Cia402(Driver[Cia402Axis]):
 
     def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
         a, b, c = self._axes
+        for axis in self._axes:
+            axis.note_feedback()
         return Feedback(
             (a.position, b.position, c.position),
             (a.shown_state, b.shown_state, c.shown_state),

@@ -149,9 +149,12 @@ def _draw_motion(
     # While the drives are disabled, the sliders move freely. Their distance from the setpoints is then meaningless.
     enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
     error = np.where(enabled, records["following_error"], np.nan)
-    _draw_curves(panels["x, y [mm]"], t, records["pose"][:, :2] * 1e3, CENTRE)
-    _draw_curves(panels["φ [°]"], t, np.degrees(records["pose"][:, 2:]), (PHI,))
-    _draw_curves(panels["λ [mm]"], t, slider_positions(records) * 1e3, SLIDERS)
+    # The position of a slider that is not homed, and a pose that depends on it, are relative to an unknown place.
+    pose = np.where(records["homed"].all(axis=1)[:, np.newaxis], records["pose"], np.nan)
+    sliders = np.where(records["homed"], slider_positions(records), np.nan)
+    _draw_curves(panels["x, y [mm]"], t, pose[:, :2] * 1e3, CENTRE)
+    _draw_curves(panels["φ [°]"], t, np.degrees(pose[:, 2:]), (PHI,))
+    _draw_curves(panels["λ [mm]"], t, sliders * 1e3, SLIDERS)
     _draw_curves(panels["velocity [mm/s]"], t, records["commanded_velocity"] * 1e3, SLIDERS)
     _draw_curves(panels["error [µm]"], t, error * 1e6, SLIDERS)
     _label_curves(panels["x, y [mm]"], "xy", CENTRE)
@@ -159,10 +162,10 @@ def _draw_motion(
     if limits is None:
         return
     slider, platform = limits.slider, limits.platform
-    for x_or_y, values in zip((platform.x, platform.y), records["pose"][:, :2].T, strict=True):
+    for x_or_y, values in zip((platform.x, platform.y), pose[:, :2].T, strict=True):
         _draw_bounds(panels["x, y [mm]"], values * 1e3, x_or_y[0] * 1e3, x_or_y[1] * 1e3)
     for low, high in dict.fromkeys(slider.positions):
-        _draw_bounds(panels["λ [mm]"], slider_positions(records) * 1e3, low * 1e3, high * 1e3)
+        _draw_bounds(panels["λ [mm]"], sliders * 1e3, low * 1e3, high * 1e3)
     for velocity in dict.fromkeys(slider.velocities):
         _draw_bounds(panels["velocity [mm/s]"], records["commanded_velocity"] * 1e3, -velocity * 1e3, velocity * 1e3)
     allowed = slider.following_error * 1e6

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO, Final
+from types import SimpleNamespace
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import pyarrow as pa
@@ -100,7 +101,9 @@ def _save_numpy(rows: pa.Table, file: BinaryIO) -> None:
     array = np.empty(len(rows), [(name, column.dtype) for name, column in zip(rows.column_names, columns, strict=True)])
     for name, column in zip(rows.column_names, columns, strict=True):
         array[name] = column
-    np.save(file, array)
+    # numpy would write to the descriptor of a file itself, and ignore an error of its last write.
+    writer: Any = SimpleNamespace(write=file.write)
+    np.save(writer, array)
 
 
 _WRITERS: Final[Mapping[str, Callable[[pa.Table, BinaryIO], None]]] = {

@@ -17,12 +17,13 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
     Raises ServiceError if the file already exists or cannot be written.
     """
     try:
-        with path.open("xb") as file:
-            try:
+        file = path.open("xb")
+        try:
+            with file:
                 yield file
-            except BaseException:
-                path.unlink(missing_ok=True)
-                raise
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
     except FileExistsError as error:
         raise ServiceError(f"{path} already exists: choose another file") from error
     except OSError as error:

@@ -323,12 +323,14 @@ def _replayable_part(recording: Recording) -> tuple[NDArray[np.void], list[Contr
 
 def _check_recording(recording: Recording, records: NDArray[np.void], config: Config) -> None:
     begins, cycle = MODES[int(records["mode"][0])], int(records["cycle"][0])
-    if begins is not Mode.DISABLED:
+    first = recording.requests[0].seq if recording.requests else 1
+    if begins is not Mode.DISABLED or first != 1:
+        what = f"in mode {begins}" if begins is not Mode.DISABLED else f"with input {first} of the control"
         raise ServiceError(
-            f"the recording begins at cycle {cycle} in mode {begins}; a replay needs a recording that begins in mode "
-            "disabled. Give all files of a rotated recording (-part2 and so on). A black box, or the file of a "
-            "recorder "
-            "that was restarted, cannot be replayed: read it with trirail report and trirail export"
+            f"the recording begins at cycle {cycle} {what}; a replay needs a recording that begins in mode disabled, "
+            "with the first input of the control. Give all files of a rotated recording (-part2 and so on). A black "
+            "box, or the file of a recorder that was restarted, cannot be replayed: read it with trirail report and "
+            "trirail export"
         )
     rate = round(1.0 / float(np.median(np.diff(recording.t[:1000])))) if len(recording.t) > 1 else 0
     if rate and rate != config.loop.rate_hz:

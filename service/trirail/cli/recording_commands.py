@@ -136,7 +136,7 @@ def export(
     format
         Format of the file. If absent, the suffix of --out selects it.
     """
-    path = out or file[0].with_suffix(f".{format or 'csv'}")
+    path = out or file[0].parent / f"{file[0].stem}.{format or 'csv'}"
     if format is not None and path.suffix != f".{format}":
         raise TrirailError(f"{path}: the name of a file of format {format} must end in .{format}")
     wanted = [column.strip() for column in columns.split(",") if column.strip()]

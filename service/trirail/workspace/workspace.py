@@ -95,8 +95,9 @@ def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geomet
         return section(geometry, limits, phi)
 
     low, high = phi_range(geometry)
-    # The limits of the platform may be closer together than the samples between the walls.
-    window = np.clip(np.linspace(*limits.platform.phi, 33), low, high)
+    # The limits of the platform may be closer together than the samples between the walls. If it is the sliders that
+    # allow only a narrow range, this usually contains phi = 0.
+    window = np.clip([*np.linspace(*limits.platform.phi, 33), 0.0], low, high)
     scan = np.unique(np.concatenate([np.linspace(low, high, 257), window]))
     filled = np.flatnonzero([len(slice_at(phi)) > 0 for phi in scan])
     if len(filled) == 0:
