@@ -150,7 +150,7 @@ def _draw_motion(
     enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
     error = np.where(enabled, records["following_error"], np.nan)
     # The position of a slider that is not homed, and a pose that depends on it, are relative to an unknown place.
-    pose = np.where(records["homed"].all(axis=1)[:, np.newaxis], records["pose"], np.nan)
+    pose = np.where(np.all(records["homed"], axis=1, keepdims=True), records["pose"], np.nan)
     sliders = np.where(records["homed"], slider_positions(records), np.nan)
     _draw_curves(panels["x, y [mm]"], t, pose[:, :2] * 1e3, CENTRE)
     _draw_curves(panels["φ [°]"], t, np.degrees(pose[:, 2:]), (PHI,))
