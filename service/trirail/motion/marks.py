@@ -111,7 +111,10 @@ class GoalMarks:
         """Time along the path of the run at which the path of this goal begins [s]."""
         self._marks = tuple(marks)
         self._rows = np.frombuffer(switches, SWITCH) if switches else _NO_SWITCHES
-        self._passed = np.zeros(len(self._rows), np.bool)
+        self._of: dict[str, tuple[NDArray[np.void], NDArray[np.bool]]] = {}
+        """Switches of each output, and whether the goal later switches the output back."""
+        self._passed: dict[str, int] = {}
+        """Number of switches of each output that have taken place."""
         if switches and not (np.isfinite(self._rows["s"]).all() and np.all(self._rows["mark"] < len(self._marks))):
             raise ValueError(f"switches that do not belong to the {len(self._marks)} marks of goal {goal!r}")
 
@@ -131,21 +134,25 @@ class GoalMarks:
             Whether the goal later switches the output back.
 
         """
-        rows = self._rows[self._pending_rows(output)]
+        switches, opens = self._switches_of(output)
+        rows, opens = switches[self._passed.get(output, 0) :].copy(), opens[self._passed.get(output, 0) :]
         rows["s"] += self.begin
-        rows = rows[rows["s"] <= end]
-        closes = np.array([mark.closes for mark in self._marks], np.bool)
-        values = np.array([mark.value for mark in self._marks], np.bool)
-        marks = rows["mark"]
-        return rows, closes[marks] & (values[marks] == rows["on"].astype(np.bool))
+        within = rows["s"] <= end
+        return rows[within], opens[within]
 
     def note_passed(self, output: str, number: int) -> None:
         """Record that the next `number` switches of an output have taken place."""
-        self._passed[self._pending_rows(output)[:number]] = True
+        self._passed[output] = self._passed.get(output, 0) + number
 
-    def _pending_rows(self, output: str) -> NDArray[np.int64]:
-        named = np.array([mark.output == output for mark in self._marks], np.bool)
-        return np.flatnonzero(~self._passed & named[self._rows["mark"]]) if len(self._rows) else np.zeros(0, np.int64)
+    def _switches_of(self, output: str) -> tuple[NDArray[np.void], NDArray[np.bool]]:
+        if output not in self._of:
+            named = np.array([mark.output == output for mark in self._marks], np.bool)
+            closes = np.array([mark.closes for mark in self._marks], np.bool)
+            values = np.array([mark.value for mark in self._marks], np.bool)
+            rows = self._rows[named[self._rows["mark"]]] if len(self._rows) else self._rows
+            marks = rows["mark"]
+            self._of[output] = rows, closes[marks] & (values[marks] == rows["on"].astype(np.bool))
+        return self._of[output]
 
 
 class _Trace:
