@@ -13,8 +13,10 @@ import msgspec
 import numpy as np
 import pytest
 from processes.test_service import until
+from trirail.analysis import charts
 from trirail.analysis.replay import replay_session
 from trirail.analysis.summary import summarise
+from trirail.cli import recording_commands
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import SIM, Config, geometry, load
@@ -271,8 +273,20 @@ def test_every_goal_has_the_outcome_that_was_said(recording: Recording) -> None:
     events = [line.event for line in reversed(recording.events) if line.event is not None]
     said = {event.id: event.outcome for event in events if event.outcome}
     assert {goal.id: goal.outcome for goal in summed.goals} == said
-    assert all(goal.ended is not None and goal.ended >= goal.given for goal in summed.goals)
+    assert all(goal.ended is not None and goal.given is not None for goal in summed.goals)
+    assert all((goal.ended or 0.0) >= (goal.given or 0.0) for goal in summed.goals)
     assert {goal.kind for goal in summed.goals} >= {"pose", "sliders"}
+
+
+def test_of_a_goal_that_was_requested_before_the_recording_nobody_knows_how_long_it_took(
+    recording: Recording, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    without = recording._replace(requests=())
+    later = summarise(without)
+    assert {(goal.given, goal.ended is None) for goal in later.goals} == {(None, False)}
+    recording_commands._print_goals(list(later.goals))
+    assert all(line.split()[0] == "before" for line in capsys.readouterr().out.splitlines())
+    charts.draw(tmp_path / "session.svg", without, later)
 
 
 def test_the_quick_stop_is_the_fault(recording: Recording) -> None:

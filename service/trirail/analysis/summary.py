@@ -37,7 +37,8 @@ class GoalSummary(msgspec.Struct, frozen=True):
     user: str
     kind: str
     outcome: str
-    given: float
+    given: float | None
+    """Time of the request; None if that is not in the recording."""
     ended: float | None
     message: str
     settle: float | None = None
@@ -228,10 +229,10 @@ def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
         yield GoalSummary(request.id, request.user, kind_name(request.goal), *_end(end, round(entry.cycle * period, 6)))
     # Goals that were requested before the recording began.
     for name, end in ends.items():
-        yield GoalSummary(name, end.user or "", UNKNOWN_LABEL, *_end(end, round(end.t, 6)))
+        yield GoalSummary(name, end.user or "", UNKNOWN_LABEL, *_end(end, None))
 
 
-def _end(event: Event | None, start: float) -> tuple[str, float, float | None, str, float | None]:
+def _end(event: Event | None, start: float | None) -> tuple[str, float | None, float | None, str, float | None]:
     if event is None:
         return UNKNOWN_LABEL, start, None, "its end is not in the recording", None
     return event.outcome or UNKNOWN_LABEL, start, round(event.t, 6), event.reason or event.message, event.settle

@@ -375,7 +375,8 @@ class CycleCaller:
             self.continue_in_python()
         if not self._prepared:
             self._prepared, self._orders = self._drives.prepare_tables(), orders
-            self._tables = self._table_arguments(self._drives.tables)
+            if self._prepared:
+                self._tables = self._table_arguments(self._drives.tables)
         if self._prepared:
             self._write_state(self._steady)
             self._motion = self._motion_arguments(self._steady.run)
