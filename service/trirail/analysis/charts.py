@@ -206,16 +206,16 @@ def _draw_modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], 
 
 def _draw_goal(panel: Axes, goal: GoalSummary, y: float, begin: float, end: float) -> None:
     """Draw a goal as a bar labelled with the goal's name. A name longer than the bar is truncated or omitted."""
-    given = begin if goal.given is None else goal.given
+    start = begin if goal.given is None else goal.given
     ended = end if goal.ended is None else goal.ended
     colour = OUTCOME_COLOURS[goal.outcome]
-    panel.add_patch(Rectangle((given, y), ended - given, 0.65, facecolor=colour, linewidth=0))
+    panel.add_patch(Rectangle((start, y), ended - start, 0.65, facecolor=colour, linewidth=0))
     if goal.outcome in ("rejected", "expired"):
-        panel.plot([given], [y + 0.32], "x", color=colour, markersize=6, markeredgewidth=2)
-    letters = int((ended - given) / max(end - begin, 1e-9) * 68.0 * FIGURE_WIDTH_IN / LETTER_WIDTH_PT) - 1
+        panel.plot([start], [y + 0.32], "x", color=colour, markersize=6, markeredgewidth=2)
+    letters = int((ended - start) / max(end - begin, 1e-9) * 68.0 * FIGURE_WIDTH_IN / LETTER_WIDTH_PT) - 1
     name = goal.id if len(goal.id) <= letters else f"{goal.id[: letters - 1]}…"
     if letters >= min(4, len(goal.id)):
-        anchor, offset = (given, y + 0.3), (3.0, 0.0)
+        anchor, offset = (start, y + 0.3), (3.0, 0.0)
         panel.annotate(
             name, anchor, offset, textcoords="offset points", color="white", fontsize=7, va="center", parse_math=False
         )

@@ -286,14 +286,14 @@ def _print_goals(goals: list[GoalSummary]) -> None:
     """Print one line per goal, without truncating it in a narrow terminal."""
     longest = max(len(goal.id) for goal in goals)
     for goal in goals:
-        given = "before" if goal.given is None else f"{goal.given:.3f} s"
+        begin = "before" if goal.given is None else f"{goal.given:.3f} s"
         took = "" if goal.ended is None or goal.given is None else f"{goal.ended - goal.given:.3f} s"
         colour = palette.code(palette.OUTCOMES[goal.outcome])
         name = terminal.plain(f"{goal.id:{longest}}")
         words = "" if goal.outcome == "done" else f": {terminal.plain(goal.message)}"
         if goal.settle is not None:
             words = f", settled in {goal.settle * 1e3:g} ms"
-        line = f"  {given:>11}  {took:>9}  [{colour}]{goal.outcome:9}[/]  {name}  {goal.kind} of "
+        line = f"  {begin:>11}  {took:>9}  [{colour}]{goal.outcome:9}[/]  {name}  {goal.kind} of "
         terminal.out.print(f"{line}{terminal.plain(goal.user)}{words}", soft_wrap=True)
 
 
