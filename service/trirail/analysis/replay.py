@@ -97,8 +97,8 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
     Raises
     ------
     ServiceError
-        The robot is not disabled at the start of the recording, so that the state of the control is unknown. Or the
-        rate of the recording differs from the configured rate.
+        The robot is not disabled at the start of the recording, or the recording lacks the first inputs, so that the
+        state of the control is unknown. Or the rate of the recording differs from the configured rate.
     """
     records, inputs = _replayable_part(recording)
     _check_recording(recording, records, config)
