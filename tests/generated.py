@@ -111,7 +111,7 @@ def _thin(config: pytest.Config, items: list[pytest.Item]) -> None:
     cases: dict[tuple[str, int], list[pytest.Item]] = {}
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        if marks.isdisjoint({"core", "alone", "vcan"}):
+        if marks.isdisjoint({"core", "alone", "vcan", "generated"}):  # their seeds are a share already
             fewest = 1 if "long" in marks else 2
             cases.setdefault((item.nodeid.partition("[")[0], fewest), []).append(item)
     effort, left_out = config.getoption("effort"), []

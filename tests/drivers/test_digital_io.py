@@ -21,7 +21,8 @@ from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.inspection import inspect
 from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.config import NO_IO, DigitalIo
-from trirail_drivers.driver.row_updates import OUTPUT_REPEATS
+from trirail_drivers.driver.axis_row import AxisRow
+from trirail_drivers.driver.row_updates import OUTPUT_REPEATS, note_outputs, outputs_pending
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.simulated.device import Nmt
 from trirail_drivers.simulated.dictionary import UNSUPPORTED_ACCESS
@@ -182,6 +183,21 @@ def test_outputs_reach_a_drive_that_hears_nothing_for_fewer_cycles_than_are_a_fa
         assert outputs_sent(rig) == [[], [], []]
     finally:
         rig.drives.close()
+
+
+@pytest.mark.parametrize("behind", [(0, 1), (1, 0), (0,), (1,), (0, 0, 1)])
+def test_outputs_are_repeated_no_longer_where_answers_come_now_before_the_setpoints_and_now_behind(
+    behind: tuple[int, ...],
+) -> None:
+    row = AxisRow(has_outputs=True, outputs=VALVE)
+    sent = 0
+    for _, late in zip(range(100), itertools.cycle(behind), strict=False):
+        row.syncs += 1
+        row.sampled, row.prompt = row.syncs - late, not late
+        if outputs_pending(row):
+            note_outputs(row)
+            sent += 1
+    assert sent == 1 + OUTPUT_REPEATS
 
 
 def test_only_named_bits_are_ever_sent(rig: Rig) -> None:

@@ -148,6 +148,6 @@ def note_outputs(row: AxisRow) -> None:
     """Record that the bus has accepted a frame with the wanted outputs. No answer shows whether the drive got it, but a
     drive that does not answer SYNCs has probably missed it.
     """
-    silent = row.syncs - row.sampled - (not row.prompt) > 0
+    silent = row.syncs - row.sampled > 1  # some drives answer the newest SYNC after this function is called
     row.outputs_repeats = OUTPUT_REPEATS if silent or row.outputs != row.outputs_sent else row.outputs_repeats - 1
     row.outputs_sent = row.outputs

@@ -119,8 +119,8 @@ class Control:
         """Whether the setpoints of the current cycle have been sent."""
         self.ahead = 0
         """Number of cycles between the newest feedback that the control knows and the present commanded motion."""
-        self._goals_before: tuple[ActiveGoal, ...] = ()
-        """Active goals before the newest decision beside the cycles, in their order."""
+        self._goal_before = ""
+        """Id of the goal that was active before the newest decision beside the cycles; "" if there was none."""
         self._edges: list[tuple[str, bool, Triple]] = []
         """Digital inputs that have changed: name, new value, and pose of the robot. They have not been handled yet."""
 
@@ -217,7 +217,9 @@ class Control:
 
     def begin_ahead(self, number: int) -> None:
         """Note that the next decisions take effect after `number` further cycles."""
-        self.ahead, self._goals_before = number, tuple(self.ledger.goals)
+        goal = self.ledger.goal
+        self.ahead, self._goal_before = number, goal.id if goal is not None else ""
+        self.ledger.passed.clear()
 
     def advance(self, number: int) -> None:
         """Advance the commanded motion by a number of cycles. The control does not evaluate these cycles."""
@@ -233,11 +235,10 @@ class Control:
         """Let a decision take effect that was made beside the newest cycles, and handle edges of inputs among them."""
         self.ahead = 0
         if self._edges:
-            # Edges from before a goal do not concern it, but they concern the goals behind which it was queued.
-            goal, before = self.ledger.goal, [goal.id for goal in self._goals_before]
-            began_before = goal is not None and before[:1] == [goal.id]
-            passed = self._goals_before[: before.index(goal.id)] if goal is not None and goal.id in before else ()
-            self._handle_edges(goal if began_before else None, passed)
+            # Edges from before a goal do not concern it, but they concern the goal that has passed on to it.
+            goal = self.ledger.goal
+            began_before = goal is not None and goal.id == self._goal_before
+            self._handle_edges(goal if began_before else None, self.ledger.passed)
             self.decide(())
 
     def return_to(self, newest: int) -> None:
@@ -410,11 +411,11 @@ class Control:
             )
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
 
-    def _handle_edges(self, goal: ActiveGoal | None, passed: Sequence[ActiveGoal] = ()) -> None:
+    def _handle_edges(self, goal: ActiveGoal | None, passed: Iterable[ActiveGoal] = ()) -> None:
         """Report digital inputs that have changed, and stop the current goal if it ends at one of these edges.
 
-        `goal` is the current goal, unless the edges are from before its beginning. `passed` are goals before the
-        current goal that had not ended at that time: if one of them ends at such an edge, the robot stops too.
+        `goal` is the current goal, unless the edges are from before its beginning. `passed` are goals that have passed
+        on to the current goal since the edges: if one of them ends at such an edge, the robot stops too.
         """
         edges, self._edges = self._edges, []
         for name, value, (x, y, phi) in edges:

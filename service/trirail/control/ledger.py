@@ -99,6 +99,8 @@ class Ledger:
         self._on_end = on_end
         self.goals: deque[ActiveGoal] = deque()
         """Current goal, followed by the queued goals."""
+        self.passed: deque[ActiveGoal] = deque(maxlen=8)
+        """Last goals that have passed on to the next goal since this was cleared."""
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
         self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
@@ -212,6 +214,7 @@ class Ledger:
     def pass_on(self) -> None:
         """End the first goal as done, because the next goal has begun."""
         goal = self.goals.popleft()
+        self.passed.append(goal)
         following = self.goals[0].id
         reason = coded(f"passed on the way to goal {following}", EventCode.PASSED, goal=following)
         self._end_goal(goal.id, goal.user, goal.kind, "done", reason)

@@ -442,7 +442,7 @@ def _rehearse(state: NDArray[np.void], moment: NDArray[np.int64], motion: Motion
     """
     s, began = state[0], now_ns(moment)
     if s.injected_ns < 0 and began + 2 * s.rehearsal_ns > s.deadline_ns:
-        s.rehearsal_ns -= s.rehearsal_ns // 64  # after a single delay, rehearsals begin again
+        s.rehearsal_ns -= s.rehearsal_ns // 4096  # after a single delay, rehearsals begin again
         return
     copy_state(rehearsal.copies, False)
     rehearsal.state[0].synced = _now_ns(state, moment) / 1e9
