@@ -107,15 +107,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _thin(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out all but a share of the cases of each test; keep at least one of a long test, two of another."""
-    cases: dict[tuple[str, int], list[pytest.Item]] = {}
+    """Leave out all but a share of the cases of each test; keep one at least of a long test and for each seed of a
+    generated one, and two of any other.
+    """
+    cases: dict[tuple[str, int, Any], list[pytest.Item]] = {}
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        if marks.isdisjoint({"core", "alone", "vcan", "generated"}):  # their seeds are a share already
-            fewest = 1 if "long" in marks else 2
-            cases.setdefault((item.nodeid.partition("[")[0], fewest), []).append(item)
+        if marks.isdisjoint({"core", "alone", "vcan"}):
+            fewest = 1 if marks & {"long", "generated"} else 2
+            seed = item.callspec.params.get("seed") if hasattr(item, "callspec") else None
+            cases.setdefault((item.nodeid.partition("[")[0], fewest, seed), []).append(item)
     effort, left_out = config.getoption("effort"), []
-    for (_, fewest), each in cases.items():
+    for (_, fewest, _), each in cases.items():
         each.sort(key=lambda item: zlib.crc32(item.nodeid.encode()))  # no order of theirs, and the same at every run
         left_out += each[max(fewest, round(len(each) * effort)) :]
     config.hook.pytest_deselected(items=left_out)
