@@ -312,7 +312,6 @@ class Cia402Axis(Axis):
         (inputs,) = canopen_frames.INPUTS.unpack(data)
         self.update_inputs()
         self._received_inputs = inputs & self.io.inputs
-        self.update_inputs()
 
     def start_inputs(self, inputs: int) -> None:
         """Set the digital inputs at the end of a set-up."""
