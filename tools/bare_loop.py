@@ -29,6 +29,14 @@ from trirail_drivers.interface import NAMES
 _SYNC, _SETPOINT, _POSITION = 0x080, 0x201, 0x181
 """CAN identifiers of SYNC and of the first node's setpoint and position (CiA 301, predefined connection set)."""
 _DATA = bytes(8)
+_BUSY = """
+import os, sys
+os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+os.sched_setaffinity(0, {int(sys.argv[1])})
+while os.getppid() == int(sys.argv[2]):
+    pass
+"""
+"""Program that keeps a processor busy until its parent has ended. It gives up inherited real-time rights first."""
 
 
 class BareCycles(NamedTuple):
@@ -58,18 +66,30 @@ def prepare() -> None:
     _frames_of_drives(0)
 
 
-def measure(loop: LoopTable, rate_hz: int, seconds: float) -> BareCycles:
+def measure(loop: LoopTable, rate_hz: int, seconds: float, *, busy: bool = False) -> BareCycles:
     """Acquire the real-time rights of the service's loop, and run the bare loop for `seconds` [s].
 
-    The process has these rights until it ends.
+    The process has these rights until it ends. With `busy`, an ordinary program keeps every other processor busy, as
+    the other processes of a service may: it takes longer then to wake the drives.
     """
     prepare()
     realtime.acquire(loop)
     period, cycles = 1_000_000_000 // rate_hz, max(1, round(seconds * rate_hz))
     lateness, work = np.zeros(cycles, np.int64), np.zeros(cycles, np.int64)
-    with _drives(loop) as carrier:
+    with _drives(loop) as carrier, _busy_processors(loop) if busy else contextlib.nullcontext():
         answers = _frames_of_drives(carrier.fileno()).exchange(period, lateness, work)
     return BareCycles(lateness, work, period, answers)
+
+
+@contextlib.contextmanager
+def _busy_processors(loop: LoopTable) -> Iterator[None]:
+    """Keep every processor busy except that of the loop, without real-time rights, until the context ends."""
+    with contextlib.ExitStack() as stack:
+        for processor in set(range(os.cpu_count() or 1)) - {realtime.processor(loop)}:
+            command = [sys.executable, "-c", _BUSY, str(processor), str(os.getpid())]
+            spinning = stack.enter_context(subprocess.Popen(command, start_new_session=True))
+            stack.callback(spinning.kill)
+        yield
 
 
 @contextlib.contextmanager

@@ -7,7 +7,9 @@ which runs in real time on the other processor, so that a cycle contains only th
 of the two processors, the other waits. Faults are counted and reset.
 
 Before and after the service, a bare loop that only exchanges a cycle's frames runs together with cyclictest. The time
-of the bare loop is the machine's share of the service's time. If the service cannot keep a rate, the report says so.
+of the bare loop is the machine's share of the service's time. After the service, it runs once more while an ordinary
+program keeps the other processors busy, as the other processes of the service do at times. If the service cannot keep a
+rate, the report says so.
 """
 
 from __future__ import annotations
@@ -54,15 +56,18 @@ def _measure_rate(rate: int, seconds: float, runs: int) -> dict[str, Any]:
         except (TrirailError, _NotKeptError) as error:
             service = {"not_kept": str(error)}
         bare.append(_bare(rate, BARE * seconds, folder / "after.json"))
-    return with_ratios({"rate_hz": rate, "seconds": seconds, **service}, together(bare))
+        beside_busy = _bare(rate, BARE * seconds, folder / "busy.json", busy=True)
+    loops = {"bare": together(bare), "bare_beside_busy": together([beside_busy])}
+    return with_ratios({"rate_hz": rate, "seconds": seconds, **service}, loops)
 
 
-def with_ratios(service: dict[str, Any], bare: dict[str, Any]) -> dict[str, Any]:
-    """Return the results of the service's loop and of the bare loop, and their ratios if the service kept the rate."""
-    results = {**service, "bare": bare}
+def with_ratios(service: dict[str, Any], loops: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the results of the service's loop and of the bare loops, and their ratios if the service kept the rate."""
+    results = {**service, **loops}
     if "not_kept" not in service:
-        pairs = {what: zip(service[what], bare[what], strict=True) for what in ("cycle", "lateness")}
-        results["to_bare"] = {what: [a / b for a, b in each] for what, each in pairs.items()}
+        for name, bare in loops.items():
+            pairs = {what: zip(service[what], bare[what], strict=True) for what in ("cycle", "lateness")}
+            results[f"to_{name}"] = {what: [a / b for a, b in each] for what, each in pairs.items()}
     return results
 
 
@@ -108,13 +113,13 @@ def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, An
     }
 
 
-def _bare(rate: int, seconds: float, result: Path) -> tuple[bare_loop.BareCycles, int]:
+def _bare(rate: int, seconds: float, result: Path, *, busy: bool = False) -> tuple[bare_loop.BareCycles, int]:
     """Measure the bare loop in a separate process; return its cycles and the number of ticks that the machine lost."""
     loop = load(SIM).loop
     with ProcessPoolExecutor(1, get_context("spawn"), bare_loop.prepare) as alone:
         alone.submit(os.getpid).result()  # wait until it has compiled the loop
         beside = Beside(seconds, 1_000_000 // rate, loop.priority, result)
-        cycles = alone.submit(bare_loop.measure, loop, rate, seconds).result()
+        cycles = alone.submit(bare_loop.measure, loop, rate, seconds, busy=busy).result()
     return cycles, beside.ticks_lost(beside.lateness())
 
 

@@ -83,12 +83,14 @@ def test_the_loop_is_measured_beside_the_machine(
     told = bench_loop.measure(0.6, (1000,), 1)
     (found,) = told["rates"]
     assert set(found["parts"]) == set(PART_NAMES)
-    bare = found["bare"]
-    assert 0 < bare["answers"] <= 3 * bare["cycles"]
     assert all(is_spread(found[what]) for what in ("to_setpoints", "to_record"))
     for what in ("cycle", "lateness"):
         assert is_spread(found[what])
-        assert found["to_bare"][what] == [a / b for a, b in zip(found[what], bare[what], strict=True)]
+    for name in ("bare", "bare_beside_busy"):
+        bare = found[name]
+        assert 0 < bare["answers"] <= 3 * bare["cycles"]
+        for what in ("cycle", "lateness"):
+            assert found[f"to_{name}"][what] == [a / b for a, b in zip(found[what], bare[what], strict=True)]
     assert_shown(told, capsys)
 
 
@@ -144,7 +146,7 @@ def test_a_rate_that_is_not_kept_is_said_and_not_met(rate: int, rows_of_rate: in
     bare = bench_loop.together([(cycles, 1), (cycles, 0)])
     assert (bare["cycles"], bare["answers"], bare["missed"], bare["lost_by_the_machine"]) == (4, 10, 4, 1)
     assert bare["cycle"][-1] == 40.0
-    found = bench_loop.with_ratios({"rate_hz": rate, "seconds": 1.0, "not_kept": "9 faults"}, bare)
+    found = bench_loop.with_ratios({"rate_hz": rate, "seconds": 1.0, "not_kept": "9 faults"}, {"bare": bare})
     assert "to_bare" not in found
     assert any("9 faults" in line for line in bench.lines({"rates": [found]}))
     rows = bench_aims.table({"loop": {"rates": [found]}})
