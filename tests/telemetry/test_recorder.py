@@ -193,6 +193,17 @@ def test_what_is_no_file_is_not_recorded_to(tmp_path: Path, kind: str) -> None:
         Recorder(load(SIM), tmp_path, path=path, live=False)
 
 
+def test_a_file_that_another_recorder_is_writing_is_not_begun_anew(tmp_path: Path) -> None:
+    first = recorder(tmp_path)
+    feed(first, made.records(0.2))
+    with pytest.raises(ServiceError, match=rf"{first.path.name} is being written.*name another file"):
+        recorder(tmp_path, path=first.path)
+    first.close()
+    assert len(read(first.path)[0]) == 200
+    recorder(tmp_path, path=first.path).close()
+    assert chunks(first.path, "/record") == []
+
+
 def test_a_live_port_in_use_is_refused(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -14,6 +14,7 @@ from collections import namedtuple
 from datetime import date, datetime
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import made
@@ -320,11 +321,13 @@ def test_files_that_are_being_written_take_the_place_of_at_most_half_of_the_othe
     ),
     own=st.integers(0, 12),
     at_most=st.integers(0, 30),
+    shortage=st.integers(-5, 30),
+    boxes=st.integers(0, 3),
 )
 def test_parts_of_the_running_session_go_last_whatever_clocks_said(
-    others: list[tuple[date, int, float]], own: int, at_most: int
+    others: list[tuple[date, int, float]], own: int, at_most: int, shortage: int, boxes: int
 ) -> None:
-    """Of others the older go first, by name, and a second part before the tenth."""
+    """Of others the older go first, by name, and a second part before the tenth. A full disk costs no black box."""
     with tempfile.TemporaryDirectory() as parent:
         folder, session = Path(parent), "demo-20260101-120000"
         names = {f"other-{day:%Y%m%d}-000000-part{part}": (day, part) for day, part, _ in others}
@@ -333,9 +336,14 @@ def test_parts_of_the_running_session_go_last_whatever_clocks_said(
         parts = [session, *(f"{session}-part{number}" for number in range(2, own + 1))][:own]
         for name in parts:
             kept(folder, f"{name}.rrd", 1)
-        in_order = [*sorted(names, key=names.__getitem__), *parts]
-        deleted = retention.tidy(folder, at_most * 1e6, session).deleted
-        assert [path.stem for path in deleted] == in_order[: max(0, len(in_order) - at_most)]
+        black_boxes = [f"fault-200001{number + 10}-120000" for number in range(boxes)]
+        for name in black_boxes:
+            kept(folder, f"{name}.rrd", 1)
+        others_and_own = [*sorted(names, key=names.__getitem__), *parts]
+        in_order = [*others_and_own, *black_boxes]
+        deleted = retention.tidy(folder, at_most * 1e6, session, shortage * 1e6).deleted
+        gone = max(0, len(in_order) - at_most, min(shortage, len(others_and_own)))
+        assert [path.stem for path in deleted] == in_order[:gone]
 
 
 def test_every_name_that_the_recorder_chooses_is_counted_and_deleted(tmp_path: Path) -> None:
@@ -366,6 +374,33 @@ def test_the_recorder_tidies_its_folder(tmp_path: Path) -> None:
     recording.close()
     assert parts(tmp_path) == [recording.path]
     assert told == [f"old recordings deleted, because all recordings exceed telemetry.keep_mb = 2: {old.name}"]
+
+
+def test_the_recorder_makes_room_on_a_disk_that_is_nearly_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a small disk, recording would otherwise end for ever before the recordings reach `keep_mb`."""
+    old = [kept(tmp_path, f"demo-2096010{day}-110000.rrd", 40, AHEAD) for day in (1, 2, 3)]
+    box = kept(tmp_path, "fault-20960101-100000.rrd", 40, AHEAD)
+    size, others = 300e6, 0.0
+
+    def usage(folder: Path) -> SimpleNamespace:
+        return SimpleNamespace(free=size - others - sum(path.stat().st_size for path in Path(folder).glob("*.rrd")))
+
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    time, told = Time(), list[str]()
+    recording = recorder(tmp_path, time, configured(), warn=lambda text: told.append(text.text))
+    sent = made.records(50.0)
+    feed(recording, sent[:11_000], time)
+    assert [path.exists() for path in old] == [True, True, True]
+    others = 30e6
+    feed(recording, sent[11_000:22_000], time)
+    assert [path.exists() for path in old] == [False, True, True]
+    others = 290e6  # by another program: everything else is deleted, but no black box
+    feed(recording, sent[22_000:33_000], time)
+    assert [path.exists() for path in (*old, box, recording.path)] == [False, False, False, True, True]
+    recording.close()
+    told = [words for words in told if "deleted" in words]
+    assert told[0] == f"old recordings deleted, because less than 134 MB of the disk were free: {old[0].name}"
+    assert len(told) == 2
 
 
 def test_a_recording_that_cannot_be_deleted_leaves_the_others_to_be_deleted(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -26,7 +27,7 @@ from trirail.telemetry.journal import EVENTS, REQUESTS
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.retention import STAMP, name_in_order
 from trirail.telemetry.rotation import RotatedFiles, claim
-from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
+from trirail.telemetry.sinks import RESERVE, Relay, free_space, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
 from trirail.wire.event_codes import EventCode, EventText, coded, encodable
 from trirail.wire.messages import Event
@@ -42,6 +43,8 @@ A low rate saves space. Nothing is lost, because the drawings can be made again 
 """
 CHECKS_HZ = 1
 """Number of times per second that the files, the folder, the log and the live view are checked."""
+FREE = 2 * RESERVE
+"""Free space of the disk below which old recordings are deleted [bytes]. Below RESERVE, nothing would be recorded."""
 TIDY_EVERY = 10.0
 """Interval at which the folder is checked, and at which the sidecar of the newest file is written [s]."""
 MAX_UNWRITTEN = 1000
@@ -390,6 +393,7 @@ class Recorder:
             volumes.turn()
 
     def _tidy(self, folder: Path, at_most: float) -> None:
+        """Delete the oldest recordings if all need more than `at_most` bytes, or if little of their disk is free."""
         deleted, errors = retention.tidy(folder, at_most, self._first.stem)
         if deleted:
             names = ", ".join(path.name for path in deleted)
@@ -397,6 +401,13 @@ class Recorder:
                 f"old recordings deleted, because all recordings exceed telemetry.keep_mb = {at_most / MB:g}: {names}"
             )
             self._warn(coded(words, EventCode.RECORDINGS_DELETED, keep_mb=at_most / MB, files=names))
+        if (shortage := FREE - free_space(folder)) > 0:
+            deleted, failed = retention.tidy(folder, math.inf, self._first.stem, shortage)
+            errors += failed
+            if deleted:
+                names = ", ".join(path.name for path in deleted)
+                words = f"old recordings deleted, because less than {FREE / MB:.0f} MB of the disk were free: {names}"
+                self._warn(coded(words, EventCode.RECORDINGS_DELETED_FOR_SPACE, free_mb=FREE / MB, files=names))
         others = f", and {len(errors) - 1} more" if len(errors) > 1 else ""
         why = f"{errors[0]}{others}" if errors else ""
         if why and why != self._tidy_error:
@@ -425,10 +436,13 @@ def _remedy(error: OSError) -> str:
 def _overwrite(path: Path) -> Path:
     """Create an empty file, or truncate an existing file.
 
-    Raises FileError if the file is not a regular file. Opening a FIFO would wait for a reader.
+    Raises FileError if the file is not a regular file (opening a FIFO would wait for a reader), and ServiceError if a
+    recorder is writing the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         files.check(path)
+        if retention.is_being_written(path):
+            raise ServiceError(f"{path} is being written, perhaps by another service; name another file")
     path.open("wb").close()
     return path

@@ -1,4 +1,5 @@
-"""Retention of recordings: the oldest recordings are deleted when all recordings together need too much space.
+"""Retention of recordings: the oldest recordings are deleted when all recordings together need too much space, or when
+their disk is nearly full.
 
 The age of a recording follows from the dates and numbers in its name, not from file times. On a machine without a
 battery-backed clock, file times can be wrong by years until the machine has received the network time, which a machine
@@ -146,19 +147,20 @@ class Tidied(NamedTuple):
     """Reasons why older recordings could not be deleted."""
 
 
-def tidy(directory: Path, at_most: float, session: str = "") -> Tidied:
-    """Delete the oldest recordings until the others need at most `at_most` bytes.
+def tidy(directory: Path, at_most: float, session: str = "", shortage: float = 0.0) -> Tidied:
+    """Delete the oldest recordings until the others need at most `at_most` bytes and `shortage` bytes have become free.
 
-    Recordings of the running `session` are deleted after those of other sessions, regardless of their dates. Black
-    boxes are deleted last. A file that is being written is not deleted, and all such files count for at most half of
-    `at_most`: a single large one would otherwise take the place of every other recording. A recording that cannot be
-    deleted is reported and does not count, for the same reason.
+    Because of a shortage, no black box is deleted: something else may be filling the disk. Recordings of the running
+    `session` are deleted after those of other sessions, regardless of their dates. Black boxes are deleted last. A file
+    that is being written is not deleted, and all such files count for at most half of `at_most`: a single large one
+    would otherwise take the place of every other recording. A recording that cannot be deleted is reported and does not
+    count, for the same reason.
     """
     try:
         recordings = sorted(_recordings(directory, session), key=lambda kept: kept.order)
     except OSError as error:
         return Tidied([], [error])
-    if sum(kept.size for kept in recordings) <= at_most:
+    if sum(kept.size for kept in recordings) <= at_most and shortage <= 0.0:
         return Tidied([], [])
     finished, errors = list[_StoredRecording](), list[OSError]()
     being_written = 0
@@ -175,7 +177,8 @@ def tidy(directory: Path, at_most: float, session: str = "") -> Tidied:
     total = sum(kept.size for kept in finished) + min(being_written, at_most / 2.0)
     deleted = list[Path]()
     for kept in finished:
-        if total <= at_most:
+        is_black_box = kept.order[0]
+        if total <= at_most and (shortage <= 0.0 or is_black_box):
             break
         try:
             delete(kept.path)
@@ -183,6 +186,7 @@ def tidy(directory: Path, at_most: float, session: str = "") -> Tidied:
             errors.append(error)
         else:
             deleted.append(kept.path)
+            shortage -= kept.size
         total -= kept.size
     return Tidied(deleted, errors)
 

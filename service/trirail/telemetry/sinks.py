@@ -6,6 +6,7 @@ module never waits long for a sink, and counts the data that does not reach a si
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import socket
@@ -27,6 +28,14 @@ RESERVE = 64 << 20
 """Space that is left free on the disk [bytes]. Rerun's file sink never recovers from a full disk."""
 DISK_TIMEOUT_S = 2.0
 """Maximum time to wait for the disk, or for a thread to end [s]."""
+
+
+def free_space(directory: Path) -> float:
+    """Return the free space of a folder's disk [bytes]; inf if it cannot be read."""
+    try:
+        return shutil.disk_usage(directory).free
+    except OSError:
+        return math.inf
 
 
 def disk_shortage(directory: Path, reserve: int) -> str:

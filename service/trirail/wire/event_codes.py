@@ -102,6 +102,11 @@ class EventCode(StrEnum):
     RECORDING_MOVED = "recording_moved", "a recording was deleted or moved", "file", "next"
     CAPTURE_MOVED = "capture_moved", "a log of CAN frames was deleted or moved", "file"
     RECORDINGS_DELETED = "recordings_deleted", "old recordings were deleted", "keep_mb", "files"
+    RECORDINGS_DELETED_FOR_SPACE = (
+        "recordings_deleted_for_space",
+        "old recordings were deleted, because the disk was nearly full",
+        *("free_mb", "files"),
+    )
     RECORDINGS_KEPT = "recordings_kept", "old recordings cannot be deleted", "error"
     NOT_INDEXED = "not_indexed", "the index of sessions cannot be written", "error"
     BLACK_BOX_INCOMPLETE = "black_box_incomplete", "parts of the minute before a fault are missing", "file", "error"
