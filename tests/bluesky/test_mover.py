@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import pytest
 from trirail.bluesky import UnfinishedError
+from trirail.bluesky import mover as mover_module
 from trirail.bluesky.flight import Flight
 from trirail.bluesky.mover import AxisMove, Mover, cancel, setpoint_of
 from trirail.client import goal as goal_module
@@ -46,6 +47,7 @@ class Robot:
         self.accepts = asyncio.Event()
         self.accepts.set()
         self.refuses: Exception | None = None
+        self.cancelled = 0
         self.told: asyncio.Queue[State | Exception] = asyncio.Queue()
 
     async def state(self) -> State:
@@ -62,7 +64,11 @@ class Robot:
 
     async def move_to(self, x: float, y: float, phi: float, **_: Any) -> AsyncGoalHandle:
         self.targets.append((x, y, phi))
-        await self.accepts.wait()
+        try:
+            await self.accepts.wait()
+        except asyncio.CancelledError:
+            self.cancelled += 1
+            raise
         if self.refuses is not None:
             raise self.refuses
         goal = AsyncGoalHandle(f"g{len(self.goals) + 1}", self._stop, self._answer, self._answer)
@@ -262,6 +268,52 @@ def test_a_lost_service_ends_the_sets_and_the_next_goal_is_sent(told: list[State
     run(work)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_stop_after_the_service_was_lost_stops_the_goal_of_then(known: bool) -> None:
+    """The robot may still be moving, although the set has ended with an error."""
+
+    async def work(robot: Robot, mover: Mover) -> None:
+        first = mover.start({0: 0.01})
+        await until(lambda: len(robot.goals) == 1)
+        robot.told.put_nowait(ServiceError("no state"))
+        assert await outcome(first) == "ServiceError"
+        if not known:  # the service has restarted, or the goal's end was missed
+            robot.goals[0].end(Result("g1", "done", ""))
+        await mover.stop(success=True)
+        assert robot.under_way == []
+        await mover.stop(success=True)
+
+    run(work)
+
+
+def test_a_stop_does_not_wait_for_an_answer_that_does_not_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client stops a goal whose sending is cancelled, in case the service has received it."""
+    monkeypatch.setattr(mover_module, "ANSWERED_S", 0.02)
+
+    async def work(robot: Robot, mover: Mover) -> None:
+        robot.accepts.clear()
+        move = mover.start({0: 0.01})
+        await until(lambda: len(robot.targets) == 1)
+        flight = Stage(robot, mover).flight()
+        begun = flight.kickoff()
+        await until(lambda: len(robot.targets) == 2)
+        with pytest.raises(ServiceError, match="not answered"):
+            await mover.stop(success=True)
+        with pytest.raises(ServiceError, match="not answered"):
+            await flight.stop()
+        assert await outcome(move) == "ServiceError"
+        with pytest.raises(ServiceError, match="before the service had answered"):
+            await begun
+        assert robot.cancelled == 2
+        robot.accepts.set()
+        behind = mover.start({0: 0.02})
+        await until(lambda: len(robot.goals) == 1)
+        robot.end("done")
+        assert await outcome(behind) == ""
+
+    run(work)
+
+
 def test_the_first_progress_of_a_set_is_of_its_own_goal() -> None:
     async def work(robot: Robot, mover: Mover) -> None:
         for x in (0.01, 0.02):
@@ -289,6 +341,14 @@ class Stage:
 
     async def link(self) -> Stage:
         return self
+
+    def note_flight(self, flight: Flight) -> None:
+        self.flights = [flight]
+
+    async def stop(self, success: bool) -> None:
+        await self.mover.stop(success)
+        for flight in self.flights:
+            await flight.stop_path(success)
 
     def flight(self) -> Flight:
         flight = Flight(cast(Any, None), lambda _: self.robot.move_to(0.1, 0.0, 0.0), False, "flight")

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 from bluesky import RunEngine, simulators
@@ -25,6 +26,7 @@ from ophyd_async.core import init_devices
 from trirail import RefusedError, Robot, ServiceError, TrirailError
 from trirail.bluesky import Stage, UnfinishedError
 from trirail.bluesky import mover as mover_module
+from trirail.bluesky.stage import StageLink
 from trirail.client import own_service
 from trirail.wire.messages import Event
 from trirail.wire.state import State
@@ -583,6 +585,102 @@ def test_an_error_of_a_monitor_does_not_end_it(stage: Stage, engine: Any, caplog
     assert "a monitor of stage-x failed" in caplog.text
     with pytest.raises(KeyError):
         stage.x.clear_sub(fail)
+
+
+@pytest.mark.parametrize("what", ["stage", "axis", "flight"])
+@pytest.mark.parametrize("elsewhere", [True, False])
+def test_a_stop_ends_what_the_stage_does_in_whichever_event_loop(
+    stage: Stage, robot: Robot, engine: Any, what: str, elsewhere: bool
+) -> None:
+    """A script may use the stage, or stop it, in a loop of its own while a plan moves it in that of the RunEngine."""
+    flight = stage.fly_to(0.05, 0.0, 0.0)
+    plan = bp.fly([flight]) if what == "flight" else bps.mv(stage.x, 0.05)
+
+    def stop() -> None:
+        if elsewhere:
+            asyncio.run(stage.x.locate())
+            asyncio.run((stage.x if what == "axis" else stage).stop())
+        else:
+            asyncio.run_coroutine_threadsafe(stage.stop(), engine.loop).result(WITHIN)
+
+    robot.override(10.0)
+    begin = newest_event(robot)
+    with when(lambda: robot.state().pose.x > 0.002, stop):
+        run(engine, plan)
+    assert outcome_of(robot, begin) == "stopped"
+    assert robot.state().commanded.pose.x < 0.04
+
+
+def test_a_path_that_a_pause_has_stopped_is_not_complete(stage: Stage, robot: Robot, engine: Any) -> None:
+    """Unless the plan repeats its kickoff; here it resumes behind that."""
+    flight = stage.fly_to(0.05, 0.0, 0.0)
+
+    def plan() -> Any:
+        yield from bps.open_run()
+        yield from bps.kickoff(flight, wait=True)
+        yield from bps.checkpoint()
+        yield from bps.sleep(0.5)
+        yield from bps.complete(flight, wait=True)
+        yield from bps.close_run()
+
+    robot.override(10.0)
+    with when(lambda: robot.state().pose.x > 0.005, engine.request_pause), pytest.raises(RunEngineInterrupted):
+        run(engine, plan())
+    with when(lambda: engine.state == "running", engine.request_pause), pytest.raises(RunEngineInterrupted):
+        engine.resume()
+    with pytest.raises(FailedStatus) as caught:
+        engine.resume()
+    assert "a checkpoint must not be between kickoff and complete" in str(caught.value.__cause__)
+
+
+def test_readings_and_setpoints_are_unknown_until_every_slider_is_homed(stage: Stage, robot: Robot) -> None:
+    state = robot.state()
+    unhomed = msgspec.structs.replace(state, sliders=msgspec.structs.replace(state.sliders, homed=(True, False, True)))
+    values = {name: reading["value"] for name, reading in stage.readings(unhomed).items()}
+    assert np.isnan([values["stage-x"], values["stage-phi"], *values["stage-pose"]]).all()
+    assert np.isnan(values["stage-sliders"]).tolist() == [False, True, False]
+
+    class Unhomed:
+        async def state(self) -> State:
+            return unhomed
+
+    async def locate() -> Any:
+        other = Stage(robot)
+        linked: Any = asyncio.get_running_loop().create_future()
+        linked.set_result(StageLink(asyncio.get_running_loop(), cast(Any, Unhomed()), cast(Any, None), cast(Any, None)))
+        other._links[asyncio.get_running_loop()] = linked
+        return await other.y.locate()
+
+    assert np.isnan([*asyncio.run(locate()).values()]).all()
+
+
+def test_a_flight_keeps_every_state_while_the_event_loop_is_blocked(stage: Stage, robot: Robot, engine: Any) -> None:
+    flight = stage.fly_to(0.03, 0.0, 0.0, speed=0.5)
+
+    def plan() -> Any:
+        yield from bps.open_run()
+        yield from bps.kickoff(flight, wait=True)
+        for _ in range(3):
+            engine.loop.call_soon_threadsafe(time.sleep, 0.2)  # a detector that reads synchronously
+            yield from bps.sleep(0.05)
+        yield from bps.complete(flight, wait=True)
+        yield from bps.collect(flight)
+        yield from bps.close_run()
+
+    states: list[State] = []
+    with robot_states(robot, states):
+        kept = pages(run(engine, plan()))["stage-t"]
+    under_way = {state.t for state in states if state.goal is not None}
+    assert len(under_way) > 10
+    assert len(under_way - set(kept)) <= 1  # one may come after the result
+
+
+def test_a_mock_is_refused_since_it_would_move_the_robot(stage: Stage, robot: Robot, engine: Any) -> None:
+    with pytest.raises(Exception, match="has no mock"), init_devices(mock=True):
+        _mocked = Stage(robot)
+    for device in (stage.x, stage.fly_to(0.0, 0.0, 0.0)):
+        with pytest.raises(TrirailError, match="has no mock"):
+            asyncio.run(device.connect(mock=True))
 
 
 def test_a_fly_scan_that_is_stopped_fails_with_the_reason(stage: Stage, robot: Robot, engine: Any) -> None:

@@ -8,6 +8,7 @@ import inspect
 import json
 import queue
 import threading
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
@@ -189,6 +190,22 @@ def test_a_goal_whose_sending_is_cancelled_is_stopped_if_it_was_taken(silent: Si
     assert keys == ["goal/ann", 'trirail/demo/cmd/ann/stop {"goal":"g"}']
 
 
+def test_a_goal_that_is_not_answered_is_stopped_if_it_was_taken(silent: Silent, locator: str) -> None:
+    """Whoever gets an error expects no motion."""
+
+    async def work(robot: AsyncRobot) -> None:
+        sending = asyncio.ensure_future(robot.move_to(x=0.0, y=0.0, phi=0.0, id="g"))
+        asked: list[tuple[str, bytes]] = []
+        while not asked or not asked[-1][0].endswith("/stop"):
+            with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as query:  # without a reply
+                asked.append((str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b""))
+        with pytest.raises(ServiceError):
+            await sending
+        assert asked[-1][1] == b'{"goal":"g"}'
+
+    run(locator, work)
+
+
 def test_a_goal_that_is_refused_is_forgotten_and_one_that_is_none_is_not_sent(silent: Silent, locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
         sending = asyncio.ensure_future(robot.move_to(x=9.0, y=0.0, phi=0.0))
@@ -335,6 +352,27 @@ def test_a_subscription_ends_with_who_iterates(silent: Silent, locator: str) -> 
 
     run(locator, work)
     assert heard == []
+
+
+def test_an_event_loop_that_was_blocked_hears_what_came_meanwhile(silent: Silent, locator: str) -> None:
+    """A silence of the service is one in which this program could have heard it."""
+    event = Event("goal", "info", "", seq=7, t=0.0, cycle=0, time=5.0)
+
+    async def work(robot: AsyncRobot) -> None:
+        for came in (True, False):
+            heard = robot.events(timeout=0.2)
+            waiting = asyncio.ensure_future(anext(heard))
+            await asyncio.sleep(0.1)
+            if came:
+                silent.publish("event", event)
+            time.sleep(0.6)  # what a detector that reads synchronously does
+            if not came:
+                asyncio.get_running_loop().call_later(0.05, silent.publish, "event", event)
+            assert (await waiting).seq == 7
+            with pytest.raises(StopAsyncIteration):
+                await anext(heard)
+
+    run(locator, work)
 
 
 def test_whoever_waits_is_told_that_the_robot_was_closed(silent: Silent, locator: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any, cast
 
@@ -11,7 +11,7 @@ from bluesky.protocols import EventCollectable, Flyable, Pausable, Reading
 from event_model import DataKey, PartialEvent
 from ophyd_async.core import AsyncStatus, Device
 
-from trirail.bluesky.mover import cancel, check_done
+from trirail.bluesky.mover import Sending, cancel, check_done
 from trirail.client.async_client import AsyncRobot
 from trirail.client.goal import AsyncGoalHandle
 from trirail.errors import TrirailError
@@ -46,7 +46,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
     def __init__(
         self,
         stage: Stage,
-        send: Callable[[AsyncRobot], Awaitable[AsyncGoalHandle]],
+        send: Callable[[AsyncRobot], Coroutine[Any, Any, AsyncGoalHandle]],
         has_marks: bool,
         name: str,
         first: Mapping[int, float] | None = None,
@@ -61,11 +61,14 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         """Readings, each with the id of the goal in progress, since states can arrive before the path is accepted."""
         self._collected = 0
         """Number of rows that `collect` has yielded."""
-        self._sending = asyncio.Lock()
+        self._sending = Sending()
         self._interrupted: AsyncGoalHandle | None = None
         """Goal that was stopped on request, which is not a failure."""
         self._stopped: bool | None = None
         """Whether the start was stopped without being a failure; None if it was not stopped."""
+        self._paused = False
+        """Whether the plan has paused since the last `kickoff`."""
+        self._begun: AsyncStatus[None] | None = None
         self._stopping: asyncio.Task[None] | None = None
         super().__init__(name)
 
@@ -73,8 +76,20 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
     def _stage(self) -> Stage:
         return cast("Stage", self.parent)
 
-    async def connect(self, *_: object, **__: object) -> None:
-        """Connect the stage to the service."""
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """Event loop in which the flight was started."""
+        return self._loop
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the flight is starting, or its path is in progress."""
+        begins = self._begun is not None and not self._begun.done
+        return begins or (self._goal is not None and self._goal.result is None)
+
+    async def connect(self, mock: object = False, *_: object, **__: object) -> None:
+        """Connect the stage to the service. Raises TrirailError if a `mock` is requested."""
+        refuse_mock(mock)
         await self._stage.link()
 
     def kickoff(self) -> AsyncStatus[None]:
@@ -83,16 +98,17 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         The calling task runs the plan. If this task ends before the path does, the path is stopped.
         """
         self._end_sampling()  # that of a path for which the plan has not called `complete`
-        self._goal, self._samples, self._collected, self._stopped = None, [], 0, None
-        self._sending = asyncio.Lock()  # a lock of this event loop
-        status = AsyncStatus(self._kickoff())
+        self._goal, self._samples, self._collected, self._stopped, self._paused = None, [], 0, None, False
+        self._loop, self._sending = asyncio.get_running_loop(), Sending()
+        self._begun = status = AsyncStatus(self._kickoff())
+        self._stage.note_flight(self)
         if (plan := asyncio.current_task()) is not None:
             plan.add_done_callback(lambda _: self._end_with_plan(status))
         return status
 
     async def _kickoff(self) -> None:
         link = await self._stage.link()
-        if self._first is not None:
+        if self._first is not None and self._stopped is None:
             await link.mover.start(self._first).end
         async with self._sending:
             if self._stopped:
@@ -103,7 +119,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
                 self._sampling = asyncio.create_task(self._sample(link.robot))
                 self._sampling.add_done_callback(lambda task: task.cancelled() or task.exception())
             try:
-                self._goal = await self._send(link.robot)
+                self._goal = await self._sending.send(self._send(link.robot))
             except BaseException:
                 self._end_sampling()
                 raise
@@ -112,8 +128,14 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
     async def complete(self) -> None:
         """Wait until the robot's measured position has settled at the end of the path.
 
-        Raises UnfinishedError with the reason if the path ends with an outcome other than done.
+        Raises UnfinishedError with the reason if the path ends with an outcome other than done, and TrirailError if a
+        pause has stopped the path and the plan has not repeated it.
         """
+        if self._paused:
+            raise TrirailError(
+                f"{self.name}: a pause has stopped the path, and the plan has resumed behind its kickoff; a checkpoint "
+                "must not be between kickoff and complete"
+            )
         goal = self._goal
         if goal is None and self._stopped:
             return
@@ -137,17 +159,28 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
 
         With `success`, `kickoff` and `complete` end without an error, also if the path has not begun.
         """
+        self.note_stop(success)
+        await self._stage.stop(success)
+        self._end_sampling()
+
+    def note_stop(self, success: bool) -> None:
+        """Record that the flight is being stopped, so that its path is not sent any more."""
         self._stopped = success
-        await (await self._stage.link()).mover.stop(success)
-        async with self._sending:  # wait until the service has accepted a goal that is being sent
-            goal = self._goal
+
+    async def stop_path(self, success: bool) -> None:
+        """Stop the path in the event loop in which it was started; return when the robot is at rest."""
+        await self._sending.end()
+        goal = self._goal
         if goal is not None and goal.result is None:
             self._interrupted = goal if success else None
             await cancel(goal)
-        self._end_sampling()
 
     async def pause(self) -> None:
-        """Stop the path. If the plan resumes from a checkpoint before `kickoff`, it repeats the path from its start."""
+        """Stop the path. If the plan resumes from a checkpoint before `kickoff`, it repeats the path from its start.
+
+        Otherwise `complete` raises an error, unless it is already in progress.
+        """
+        self._paused = self._paused or self.under_way
         await self.stop()
 
     async def resume(self) -> None:
@@ -177,8 +210,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
     def _end_with_plan(self, begun: AsyncStatus[None]) -> None:
         """Stop the path if it is starting or in progress, and end its readings; called when the plan ends."""
         self._end_sampling()
-        under_way = self._goal is not None and self._goal.result is None
-        if under_way or not begun.done:
+        if self._begun is begun and self.under_way:
             self._stopping = asyncio.create_task(self._stop_late())
 
     async def _stop_late(self) -> None:
@@ -196,7 +228,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         ]
 
     async def _sample(self, robot: AsyncRobot) -> None:
-        async with aclosing(robot.states()) as states:
+        async with aclosing(robot._connection.states(None, every=True)) as states:
             async for state in states:
                 if state.goal is not None:
                     self._samples.append((state.goal.id, self._stage.readings(state)))
@@ -205,6 +237,12 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         if self._sampling is not None:
             self._sampling.cancel()
             self._sampling = None
+
+
+def refuse_mock(mock: object) -> None:
+    """Raise TrirailError if a mock of a device is requested: the real robot would move."""
+    if mock:
+        raise TrirailError("a stage has no mock: connect it to a service with simulated drives, such as trirail demo")
 
 
 def _key(source: str, dtype: Any, unit: str) -> DataKey:

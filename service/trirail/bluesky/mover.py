@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Coroutine, Mapping
 from contextlib import aclosing
 from dataclasses import dataclass, field
+from typing import Any
 
 from trirail.client.async_client import AsyncRobot
 from trirail.client.goal import AsyncGoalHandle, Result
@@ -17,6 +18,8 @@ GATHERING_S = 0.005
 """Time after a set during which other sets join its goal [s]. Sets of a message group arrive within a millisecond."""
 SILENCE_S = 5.0
 """Time without a state after which the service counts as lost during a goal [s]."""
+ANSWERED_S = 1.0
+"""Time after which a stop no longer waits for the service's answer to a goal that is being sent [s]."""
 PROGRESS_S = 0.1
 """Interval between progress reports [s]."""
 
@@ -66,11 +69,62 @@ class _Motion:
     moves: list[AxisMove] = field(default_factory=list)
     interrupted: bool = False
     """Whether the goal was stopped on request, which is not a failure."""
+    lost: bool = False
+    """Whether it is unknown if the goal is still in progress. A stop then stops it; its sets have ended."""
 
     def finish(self, result: Result) -> None:
         """End the `set` calls of this goal, with an error if the goal has failed."""
         failed = result.outcome != "done" and not self.interrupted
         end_all(self.moves, UnfinishedError(result) if failed else None)
+
+
+class Sending:
+    """Lock under which a goal is sent, so that a stop waits for the answer of the service."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+        self._call: asyncio.Task[AsyncGoalHandle] | None = None
+        self._abandoned = False
+        """Whether a stop did not wait for the end of the present sending."""
+
+    async def __aenter__(self) -> None:
+        await self._lock.acquire()
+        self._abandoned = False
+
+    async def __aexit__(self, *_: object) -> None:
+        self._lock.release()
+
+    async def send(self, call: Coroutine[Any, Any, AsyncGoalHandle]) -> AsyncGoalHandle:
+        """Send a goal with a call of an AsyncRobot. Raises ServiceError if a stop has not waited for the answer."""
+        self._call = task = asyncio.create_task(call)
+        try:
+            if self._abandoned:
+                task.cancel()
+            return await task
+        except asyncio.CancelledError:
+            if task.cancelled() and self._abandoned:
+                raise ServiceError("the motion was stopped before the service had answered its goal") from None
+            raise
+        finally:
+            self._call = None
+
+    async def end(self) -> None:
+        """Wait until no goal is being sent.
+
+        If the service does not answer within ANSWERED_S, the client stops the goal, in case the service has received
+        it, and ServiceError is raised.
+        """
+        try:
+            async with asyncio.timeout(ANSWERED_S):
+                await self._lock.acquire()
+        except TimeoutError:
+            self._abandoned = True
+            if self._call is not None:
+                self._call.cancel()
+            raise ServiceError(
+                "the service has not answered a goal, which was stopped in case it has arrived"
+            ) from None
+        self._lock.release()
 
 
 class Mover:
@@ -88,7 +142,7 @@ class Mover:
         self._unsent: list[AxisMove] = []
         """Sets for which no goal has been sent yet. A stop ends these sets without sending a goal."""
         self._motion: _Motion | None = None
-        self._sending = asyncio.Lock()
+        self._sending = Sending()
         self._tasks: set[asyncio.Task[None]] = set()
         self.pose: Pose | None = None
         """Measured pose in the newest state during a goal; None before the first state."""
@@ -129,12 +183,19 @@ class Mover:
         """
         unsent, self._unsent, self._gathered = self._unsent, [], []
         end_all(unsent, None if success else TrirailError("the motion was stopped before its goal was sent"))
-        async with self._sending:  # wait until the service has accepted a goal that is being sent
-            motion = self._motion
+        try:
+            await self._sending.end()
+        finally:
+            await self._stop_motion(success)
+
+    async def _stop_motion(self, success: bool) -> None:
+        motion = self._motion
         if motion is None or motion.goal.result is not None:
             return
         motion.interrupted |= success
         await cancel(motion.goal)
+        if motion.lost and self._motion is motion:
+            self._motion = None
 
     async def settle(self, goal: AsyncGoalHandle) -> Result:
         """Wait for the end of a goal. Raises ServiceError if the service is lost or restarts before the goal ends."""
@@ -174,8 +235,7 @@ class Mover:
         try:
             result = await self.settle(motion.goal)
         except Exception as error:  # noqa: BLE001 - as above
-            if self._motion is motion:
-                self._motion = None  # it is unknown whether the goal is still in progress
+            motion.lost = True
             end_all(motion.moves, error)
             return
         motion.finish(result)
@@ -184,7 +244,7 @@ class Mover:
         """Send a goal for new sets, and for the sets in progress with axes that the new sets do not move."""
         carried: list[AxisMove] = []
         pose = setpoint_of(await self._robot.state())
-        if before is not None and before.goal.result is None:
+        if before is not None and before.goal.result is None and not before.lost:
             # Move the sets of other axes to the new goal before it is sent. When the service accepts the new goal, the
             # earlier goal ends, and with it the sets that remain with it.
             carried = [old for old in before.moves if not any(old.shares_axis(new) for new in moves)]
@@ -195,7 +255,7 @@ class Mover:
             for axis, value in move.targets.items():
                 target[axis] = value
         try:
-            goal = await self._robot.move_to(*target)
+            goal = await self._sending.send(self._robot.move_to(*target))
         except BaseException:
             if before is not None:
                 before.moves += carried

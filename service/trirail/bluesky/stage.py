@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
-from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Coroutine, Sequence
 from contextlib import aclosing
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
@@ -14,7 +15,7 @@ from event_model import DataKey
 from numpy.typing import NDArray
 from ophyd_async.core import AsyncLocatable, AsyncReadable, WatchableAsyncStatus, WatcherUpdate
 
-from trirail.bluesky.flight import Flight
+from trirail.bluesky.flight import Flight, refuse_mock
 from trirail.bluesky.monitor import Monitored, Readings
 from trirail.bluesky.mover import Mover, setpoint_of
 from trirail.client.async_client import AsyncRobot
@@ -54,7 +55,9 @@ class Stage(Monitored, AsyncReadable, HasHints):
 
     def __init__(self, robot: Robot, name: str = "") -> None:
         self._robot = robot
-        self._linking: asyncio.Task[StageLink] | None = None
+        self._links: dict[asyncio.AbstractEventLoop, asyncio.Task[StageLink]] = {}
+        self._flights: set[Flight] = set()
+        """Flights that have been started and have not ended."""
         self.x = MovableAxis(0)
         self.y = MovableAxis(1)
         self.phi = MovableAxis(2)
@@ -66,11 +69,12 @@ class Stage(Monitored, AsyncReadable, HasHints):
         """Keys of the readings that a table or a plot shows by default."""
         return {"fields": [self.x.name, self.y.name, self.phi.name]}
 
-    async def connect(self, *_: object, **__: object) -> None:
+    async def connect(self, mock: object = False, *_: object, **__: object) -> None:
         """Connect to the service in the running event loop, and query the robot's geometry and limits.
 
-        Raises ServiceError if the service does not answer.
+        Raises ServiceError if the service does not answer, and TrirailError if a `mock` is requested.
         """
+        refuse_mock(mock)
         await self.link()
 
     async def link(self) -> StageLink:
@@ -78,11 +82,9 @@ class Stage(Monitored, AsyncReadable, HasHints):
         if not self.name:
             self.set_name(UNNAMED)  # Bluesky's documents need a name; init_devices would have used the variable's name
         loop = asyncio.get_running_loop()
-        task = self._linking
-        failed = task is not None and task.done() and (task.cancelled() or task.exception() is not None)
-        if task is None or task.get_loop() is not loop or failed:
-            over = task is not None and task.done() and not failed and task.get_loop().is_closed()
-            task = self._linking = asyncio.create_task(self._connect(loop, task.result() if task and over else None))
+        task = self._links.get(loop)
+        if task is None or (task.done() and _made(task) is None):
+            task = self._links[loop] = asyncio.create_task(self._connect(loop))
         return await asyncio.shield(task)
 
     async def describe(self) -> Keys:
@@ -106,13 +108,25 @@ class Stage(Monitored, AsyncReadable, HasHints):
         """Return the readings of the next state.
 
         The readings are the measured pose [m, m, rad], the slider positions and following errors [m], and the nominal
-        time [s].
+        time [s]. The pose, and the position of a slider that is not homed, are NaN.
         """
         return self.readings(await (await self.link()).robot.state())
 
     async def stop(self, success: bool = True) -> None:
-        """Stop the goal of this stage's axes; return when the robot is at rest. Goals of other clients continue."""
-        await (await self.link()).mover.stop(success)
+        """Stop the goal of this stage's axes, and its flights, whichever event loop has sent them.
+
+        Return when the robot is at rest. Goals of other clients continue.
+        """
+        flights = [flight for flight in self._flights if flight.under_way]
+        for flight in flights:
+            flight.note_stop(success)
+        movers = [(loop, link.mover) for loop, task in tuple(self._links.items()) if (link := _made(task))]
+        await asyncio.gather(*(run_in(loop, mover.stop(success)) for loop, mover in movers))
+        await asyncio.gather(*(run_in(flight.loop, flight.stop_path(success)) for flight in flights))
+
+    def note_flight(self, flight: Flight) -> None:
+        """Record that a flight has been started, so that `stop` stops it; forget those that have ended."""
+        self._flights = {other for other in self._flights if other.under_way} | {flight}
 
     async def check(self, pose: Sequence[float]) -> None:
         """Let the service check the whole path to a pose against every limit, without moving.
@@ -151,7 +165,7 @@ class Stage(Monitored, AsyncReadable, HasHints):
         values: dict[str, Any] = {
             **dict(zip((self.x.name, self.y.name, self.phi.name), pose, strict=True)),
             self.pose.name: np.array(pose),
-            self.key("sliders"): np.array(state.sliders.position),
+            self.key("sliders"): np.where(state.sliders.homed, state.sliders.position, math.nan),
             self.key("following_error"): np.array(state.sliders.following_error),
             self.key("t"): state.t,
         }
@@ -179,16 +193,30 @@ class Stage(Monitored, AsyncReadable, HasHints):
             "limits": {"control": {"low": low, "high": high}},
         }
 
-    async def _connect(self, loop: asyncio.AbstractEventLoop, before: StageLink | None) -> StageLink:
-        """Return a connection for the running event loop.
-
-        `before` is an earlier connection with a closed event loop, which is closed first.
-        """
-        if before is not None:
-            await before.robot.close()
+    async def _connect(self, loop: asyncio.AbstractEventLoop) -> StageLink:
+        """Return a connection for the running event loop. Connections of closed event loops are closed first."""
+        for closed in [each for each in tuple(self._links) if each.is_closed()]:
+            if before := _made(self._links.pop(closed)):
+                with contextlib.suppress(RuntimeError):  # tasks that the closed event loop has left behind
+                    await before.robot.close()
         robot = await self._robot._for_running_loop()
         shown = DrawnRobot.from_info(await robot.info())
         return StageLink(loop, robot, shown, Mover(robot))
+
+
+def _made(task: asyncio.Task[StageLink]) -> StageLink | None:
+    """Return the connection that a task has made; None if there is none."""
+    return task.result() if task.done() and not task.cancelled() and task.exception() is None else None
+
+
+async def run_in(loop: asyncio.AbstractEventLoop, work: Coroutine[Any, Any, None]) -> None:
+    """Run `work` in an event loop, which may be that of another thread. An event loop that rests is left out."""
+    if loop is asyncio.get_running_loop():
+        await work
+    elif loop.is_running():
+        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, loop))
+    else:
+        work.close()
 
 
 class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
@@ -214,8 +242,9 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         """Key of the reading that a table or a plot shows by default."""
         return {"fields": [self.name]}
 
-    async def connect(self, *_: object, **__: object) -> None:
-        """Connect the stage to the service."""
+    async def connect(self, mock: object = False, *_: object, **__: object) -> None:
+        """Connect the stage to the service. Raises TrirailError if a `mock` is requested."""
+        refuse_mock(mock)
         await self._stage.link()
 
     async def describe(self) -> Keys:
@@ -227,12 +256,13 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         return self._own(await self._stage.read())
 
     async def locate(self) -> Location[T]:
-        """Return the setpoint and the measured value.
+        """Return the setpoint and the measured value; NaN while a slider is not homed.
 
         The setpoint is the target of the goal in progress; if there is no goal, it is the commanded value.
         """
         state = await (await self._stage.link()).robot.state()
-        return Location(setpoint=self._value(setpoint_of(state)), readback=self._value(state.measured_pose or NAN_POSE))
+        setpoint, measured = (setpoint_of(state), state.measured_pose) if state.measured_pose else (NAN_POSE, NAN_POSE)
+        return Location(setpoint=self._value(setpoint), readback=self._value(measured))
 
     @WatchableAsyncStatus.wrap
     async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:

@@ -370,7 +370,7 @@ class AsyncRobot:
             reply = await self._connection.fetch(("goal", self.user), GoalReply, last, before=before)
         except BaseException as error:
             # If a jog's renewal is cancelled, the jog itself continues until its time-out.
-            if self._goals.refuse(goal_id) and isinstance(error, asyncio.CancelledError):
+            if self._goals.refuse(goal_id) and isinstance(error, asyncio.CancelledError | ServiceError):
                 self._stop_unanswered(goal_id)
             raise
         self._goals.accept(goal, reply)
@@ -382,7 +382,7 @@ class AsyncRobot:
         return goal is not None and goal.id == goal_id
 
     def _stop_unanswered(self, goal_id: str) -> None:
-        """Stop a goal whose sender was cancelled, without waiting for a reply."""
+        """Stop a goal whose sender was cancelled or received no reply, without waiting for a reply."""
         with contextlib.suppress(ServiceError):  # the connection is closed
             stop = msgspec.json.encode(Stop(goal_id))
             self._connection.query_unanswered(("cmd", self.user, Command.STOP), stop)

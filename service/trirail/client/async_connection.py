@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, aclosing
 from typing import Any, TypeVar
@@ -19,6 +20,9 @@ from trirail.wire.state import State
 from trirail.wire.text import is_name
 
 OTHER_LOOP = "the robot belongs to another event loop: enter a robot in this one, as async with AsyncRobot(…)"
+
+BLOCKED_S = 0.1
+"""Delay of a time-out that shows that this program has blocked the event loop [s]."""
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -133,20 +137,20 @@ class AsyncConnection:
                 reply = await self.fetch(("role", user), RoleReply, within=ROLE_WITHIN)
         return self._connection.why_nobody(parts, reply)
 
-    async def states(self, timeout: float | None) -> AsyncGenerator[State]:
-        """Yield states as they arrive; skip all but the newest if the caller is slow.
+    async def states(self, timeout: float | None, *, every: bool = False) -> AsyncGenerator[State]:
+        """Yield states as they arrive; unless `every`, skip all but the newest if the caller is slow.
 
         End after `timeout` seconds without a state.
         """
-        with self._queue() as newest:
+        with self._queue() as waiting:
 
-            def keep_newest(state: State) -> None:
-                while not newest.empty():
-                    newest.get_nowait()
-                newest.put_nowait(state)
+            def keep(state: State) -> None:
+                while not (every or waiting.empty()):
+                    waiting.get_nowait()
+                waiting.put_nowait(state)
 
-            with self._connection.subscribe_to_states(self._in_loop(keep_newest)):
-                async for state in self._items_until_timeout(newest, timeout):
+            with self._connection.subscribe_to_states(self._in_loop(keep)):
+                async for state in self._items_until_timeout(waiting, timeout):
                     yield state
 
     async def events(self, history: bool, timeout: float | None) -> AsyncGenerator[Event]:
@@ -222,11 +226,18 @@ class AsyncConnection:
         return item
 
     async def _items_until_timeout(self, received: asyncio.Queue[Any], timeout: float | None) -> AsyncGenerator[Any]:
-        """Yield received items until none arrives for `timeout` seconds."""
+        """Yield received items until none arrives for `timeout` seconds.
+
+        Time in which this program blocked the event loop, or was suspended, shows nothing about the service and does
+        not count.
+        """
         while True:
+            ends = math.inf if timeout is None else self._loop.time() + timeout
             try:
                 async with asyncio.timeout(timeout):
                     item = await self._next(received)
             except TimeoutError:
-                return
-            yield item
+                if received.empty() and self._loop.time() - ends < BLOCKED_S:
+                    return
+            else:
+                yield item
