@@ -120,6 +120,7 @@ def test_nothing_is_wrong_with_a_good_machine(config: Config) -> None:
             "ethtool -C can0 rx-usecs-irq 0 rx-frames-irq 1",
         ),
         ({"coalescing": ReceiveCoalescing(0, 50)}, "can0 coalescing", "warning", "ip link set can0 down"),
+        ({"unwritable": "this user may not write in /srv"}, "recordings", "failure", "telemetry.directory"),
         ({"cycles": cycles([10_000] * 50, 600_000)}, "cycle", "warning", "loop.rate_hz = 500"),
         ({"cycles": cycles([10_000] * 50, 1_100_000)}, "cycle", "failure", "loop.rate_hz = 250"),
         ({"cycles": cycles([10_000] * 50, 90_000_000)}, "cycle", "failure", "no rate can be held"),

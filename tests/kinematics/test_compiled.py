@@ -4,8 +4,10 @@ import os
 import re
 import runpy
 import shutil
+import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -90,6 +92,61 @@ def test_kept_code_that_names_a_class_which_is_no_more_is_compiled_anew(room: Pa
         (room / "closure.py").write_text(source.format(name))
         assert run(code, tmp_path) == "2.0 1"
         assert run(code, tmp_path) == "2.0 0"
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+@pytest.mark.parametrize(
+    "damage", [lambda content: b"", lambda content: content[:-9], lambda content: bytes(len(content))]
+)
+def test_a_damaged_file_of_the_cache_is_compiled_anew(
+    room: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes]
+) -> None:
+    """A power failure leaves files empty, cut off or full of zeros."""
+    (room / "closure.py").write_text(
+        "from trirail.kinematics.compiled import compiled\n@compiled('f8(f8)')\ndef doubled(x):\n    return 2.0 * x\n"
+    )
+    code = "from trirail.kinematics.closure import doubled; print(doubled(1.0), len(doubled.stats.cache_misses))"
+    assert run(code, tmp_path) == "2.0 1"
+    assert run(code, tmp_path) == "2.0 0"
+    (file,) = room.rglob(f"*{suffix}")
+    file.write_bytes(damage(file.read_bytes()))
+    assert run(code, tmp_path) == "2.0 1"
+    assert run(code, tmp_path) == "2.0 0"
+
+
+HOMELESS = """
+import tempfile
+from numba.core import caching
+from numba.core.caching import UserProvidedCacheLocator
+caching.CacheImpl._locator_classes = [UserProvidedCacheLocator]  # no other folder can be written
+"""
+
+
+@pytest.mark.core
+def test_without_a_folder_of_its_own_compiled_code_is_in_one_for_temporary_files(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for a user of the system without a home, whose installation cannot be written."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    (room / "closure.py").write_text(
+        "from trirail.kinematics.compiled import compiled\n@compiled('f8(f8)')\ndef doubled(x):\n    return 2.0 * x\n"
+    )
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    code = f"{HOMELESS}\ntempfile.tempdir = {str(temporary)!r}\n" + (
+        "from trirail.kinematics.closure import doubled; print(doubled(1.0), len(doubled.stats.cache_misses))"
+    )
+    assert run(code, tmp_path) == "2.0 1"
+    assert run(code, tmp_path) == "2.0 0"
+    (folder,) = temporary.iterdir()
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    folder.chmod(0o777)  # others could exchange the code
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        run(code, tmp_path)
+    assert (
+        "does not belong to this user alone; set NUMBA_CACHE_DIR to a folder that can be written" in failed.value.stderr
+    )
 
 
 PACKAGE = Path(compiled.__file__).parents[1]

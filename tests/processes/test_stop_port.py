@@ -10,9 +10,11 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgspec
 import pytest
+import zenoh
 from certificates import service_port, tls_config, user
 from control_rig import CONFIG
 from hypothesis import given
@@ -24,7 +26,7 @@ from trirail.processes import stop_port
 from trirail.processes.session_guard import Guard
 from trirail.processes.sockets import Reserve, listen
 from trirail.processes.stop_port import Answer
-from trirail.wire import tls
+from trirail.wire import tls, zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
 from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopAddress, StopRequest, stop_address
@@ -328,6 +330,30 @@ def test_an_address_that_is_taken_is_told_with_the_remedy_and_the_service_goes_o
         door.close()
     guard.stop_port(lambda *_: None).close()
     assert not any("no stop port" in warning for warning in guard.warnings())
+
+
+def test_why_a_service_cannot_listen_is_said_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(locator: str) -> str:
+        with pytest.raises(ServiceError) as refused:
+            zenoh_session.open_service([locator]).close()  # type: ignore[no-untyped-call]
+        return str(refused.value)
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        locator = f"tcp/127.0.0.1:{port}"
+        assert f"Address already in use ({locator}); end the other service" in refused(locator)
+    assert "Cannot assign requested address" in refused(f"tcp/192.0.2.1:{port}")
+    assert f"there is no folder {tmp_path}/none; create it" in refused(f"unixsock-stream/{tmp_path}/none/z")
+    denied = {tmp_path}
+    monkeypatch.setattr(os, "access", lambda path, _: path not in denied)
+    with monkeypatch.context() as as_another_user:
+        as_another_user.setattr(zenoh, "open", Mock(side_effect=zenoh.ZError("no")))
+        assert f"this user may not write in {tmp_path}; change its rights" in refused(f"unixsock-stream/{tmp_path}/a")
+        denied = {tmp_path / "a.lock"}
+        (tmp_path / "a.lock").touch()
+        assert "a.lock belongs to another user" in refused(f"unixsock-stream/{tmp_path}/a")
+        denied = set()
+        assert "end the other service that may use it" in refused(f"unixsock-stream/{tmp_path}/a")
 
 
 def test_a_file_that_is_no_socket_is_kept_and_told_with_the_remedy(tmp_path: Path) -> None:

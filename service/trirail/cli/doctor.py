@@ -152,8 +152,17 @@ def examine(config: Config, machine: Machine, impossible: Sequence[str] = ()) ->
         *network(config, machine),
         *routers(machine.routers),
         *metrics(config),
+        recordings(config, machine),
         cycle(machine.cycles, config),
     ]
+
+
+def recordings(config: Config, machine: Machine) -> Check:
+    """Check that the service can write its recordings."""
+    if machine.unwritable:
+        remedy = "set telemetry.directory to a folder that can be written, or change its rights"
+        return Check("recordings", "failure", machine.unwritable, remedy)
+    return Check("recordings", "ok", f"in {config.telemetry.directory}")
 
 
 def kernel(machine: Machine, *, simulated: bool) -> Check:

@@ -61,6 +61,8 @@ class Machine(Struct, frozen=True):
     """Receive coalescing of the CAN interface; None if its driver does not report it."""
     adapter: str = ""
     """Package that python-can's interface needs and that is missing, with the remedy; "" if nothing is missing."""
+    unwritable: str = ""
+    """Reason why recordings cannot be written to their folder; "" if there is none."""
     guard: Guard | str | None = None
     """Access rules over the network, or the reason why the certificates cannot be used."""
     routers: tuple[tuple[str, str], ...] = ()

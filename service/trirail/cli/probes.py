@@ -90,6 +90,7 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         bus_timing=timing,
         coalescing=read_coalescing(channel) if channel else None,
         adapter=adapters.missing_support(config.can.interface),
+        unwritable=why_unwritable(Path(config.telemetry.directory)),
         guard=checked,
         issued=issued(config),
         limited_ports=limited_ports() if config.zenoh.tls is not None else None,
@@ -97,6 +98,14 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         if isinstance(checked, str)
         else tuple((each, checked.why_not_linked(each)) for each in config.zenoh.connect),
     )
+
+
+def why_unwritable(folder: Path) -> str:
+    """Return why this user cannot write files to a folder, which need not exist yet; "" if this user can."""
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        return f"{existing} is not a folder"
+    return "" if os.access(existing, os.W_OK | os.X_OK) else f"this user may not write in {existing}"
 
 
 def measure_bus(

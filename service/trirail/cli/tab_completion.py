@@ -24,6 +24,6 @@ def script(app: App, shell: Shell | None, *, install: bool) -> int:
             terminal.write(app.generate_completion(shell=shell))
     except ShellDetectionError as error:
         raise TrirailError("shell not recognised: use bash, zsh or fish") from error
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # a user without a home cannot be asked for a folder
         raise TrirailError(f"cannot install: {error}") from error
     return 0

@@ -6,8 +6,12 @@ import contextlib
 import fcntl
 import hashlib
 import operator
+import os
 import re
+import stat
+import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -83,17 +87,60 @@ def _alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def _kept(dispatcher: Any) -> Any:
-    """Make the cache of a compiled function invalid after any edit in ROOMS.
+def _cached(function: Callable[..., Any], **options: Any) -> Any:
+    """Return a function that numba compiles and caches.
 
-    numba only checks the file that defines the function, and would miss edits of called functions in other files. The
-    fingerprint is part of the version that numba checks first. Otherwise, numba would unpickle outdated code, which may
-    refer to classes that no longer exist.
+    If neither the folder of the source nor the user's cache directory can be written, as for a system user without a
+    home, the cache is in a folder for temporary files. Raises TrirailError if there is no such folder either.
+
+    Any edit in ROOMS makes the cache invalid. numba only checks the file that defines the function, and would miss
+    edits of called functions in other files. The fingerprint is part of the version that numba checks first. Otherwise,
+    numba would unpickle outdated code, which may refer to classes that no longer exist.
     """
+    compile_later = partial(njit, function, error_model="numpy", cache=True, **options)
+    dispatcher: Any
+    try:
+        dispatcher = compile_later()
+    except RuntimeError:
+        config.CACHE_DIR = str(_temporary_cache())  # type: ignore[attr-defined]
+        dispatcher = compile_later()
     kept = dispatcher._cache._cache_file
     kept._version = (kept._version, FINGERPRINT)
+    kept._load_index, kept._load_data = _or_nothing(kept._load_index, {}), _or_nothing(kept._load_data, None)
+    kept.save = _or_nothing(kept.save, None)
     _functions.append(dispatcher)
     return dispatcher
+
+
+def _or_nothing(use: Callable[P, R], nothing: R) -> Callable[P, R]:
+    """Return a function that uses a file of the cache, or returns `nothing` if that fails.
+
+    A power failure can leave files empty or incomplete, and a disk can be full. The function is then compiled again.
+    """
+
+    def use_if_possible(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return use(*args, **kwargs)
+        except Exception:  # noqa: BLE001 - pickle raises any error for damaged data
+            return nothing
+
+    return use_if_possible
+
+
+def _temporary_cache() -> Path:
+    """Return a folder for compiled code that belongs to this user alone. Raises TrirailError if there is none."""
+    folder = Path(tempfile.gettempdir(), f"trirail-compiled-{os.getuid()}")
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022:
+            return folder
+        why = f"{folder} does not belong to this user alone"
+    except OSError as error:
+        why = str(error)
+    from trirail_drivers.errors import TrirailError
+
+    raise TrirailError(f"no folder for compiled code: {why}; set NUMBA_CACHE_DIR to a folder that can be written")
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
@@ -102,19 +149,18 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     Use this for a few lines of arithmetic. If all functions were inlined, compilation would take three times as long,
     and the code would not run faster.
     """
-    return _kept(njit(function, error_model="numpy", forceinline=True, cache=True))  # type: ignore[no-any-return]
+    return _cached(function, forceinline=True)  # type: ignore[no-any-return]
 
 
 def compiled(*signatures: Any, releases: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function immediately for the given signatures or, without signatures, at its first call (decorator).
 
-    Division by zero gives an infinity or NaN, never an exception. Compiled code is cached in the folder of the source,
-    or in the user's cache directory if this folder is not writable. Later processes load the code from the cache. If
-    `releases` is set, the function releases the GIL during a call.
+    Division by zero gives an infinity or NaN, never an exception. Compiled code is cached on disk, and later processes
+    load the code from the cache. If `releases` is set, the function releases the GIL during a call.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        dispatcher = _kept(njit(function, error_model="numpy", cache=True, nogil=releases))
+        dispatcher = _cached(function, nogil=releases)
         kept = dispatcher._cache._cache_file
         if signatures:
             # If two processes start together, the second process loads the code that the first has compiled.

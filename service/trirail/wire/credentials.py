@@ -181,7 +181,7 @@ def credentials_for(robot: str, locator: str, folder: Path | str | None = None) 
     are unusable, or if a folder is given although the locator's protocol does not use credentials.
     """
     if reach(locator) is ReachableBy.CERTIFICATE:
-        base = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+        base = Path(os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config"))
         return Credentials.read(Path(folder or os.environ.get("TRIRAIL_TLS") or base / "trirail" / robot))
     if folder is not None:
         raise ServiceError(f"{locator}: this protocol does not use credentials; connect to tls/HOST:PORT")

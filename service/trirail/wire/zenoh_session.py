@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import socket
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -13,7 +15,7 @@ import zenoh
 from trirail.errors import ServiceError
 from trirail.wire.credentials import Credentials
 from trirail.wire.dialling import connection_problem
-from trirail.wire.endpoints import DEFAULT_LOCATOR, leads_to, socket_file
+from trirail.wire.endpoints import DEFAULT_LOCATOR, leads_to, socket_file, tcp_address
 from trirail.wire.sizes import MAX_TRANSPORT
 from trirail.wire.starting import is_starting
 
@@ -70,8 +72,29 @@ def open_service(
     return _open(
         settings,
         f"cannot listen on {', '.join(listen)}",
-        lambda: "; end the other service that may use it, or set zenoh.listen to another address",
+        lambda: f": {_listening_fault(listen)}",
     )
+
+
+def _listening_fault(listen: Sequence[str]) -> str:
+    """Return why this program cannot listen on one of the locators, and the remedy. Zenoh's errors do not tell."""
+    in_use = "end the other service that may use it, or set zenoh.listen to another address"
+    for locator in listen:
+        if (file := socket_file(locator)) is not None:
+            folder = file.parent
+            if not folder.is_dir():
+                return f"there is no folder {folder}; create it, or change zenoh.listen"
+            if not os.access(folder, os.W_OK | os.X_OK):
+                return f"this user may not write in {folder}; change its rights, or zenoh.listen"
+            if (lock := Path(f"{file}.lock")).exists() and not os.access(lock, os.R_OK | os.W_OK):
+                return f"{lock} belongs to another user; end that user's service and delete the file"
+        elif (address := tcp_address(locator)) is not None:
+            try:
+                socket.create_server(address, family=socket.AF_INET6 if ":" in address[0] else socket.AF_INET).close()
+            except OSError as error:
+                why = os.strerror(error.errno) if isinstance(error.errno, int) and error.errno > 0 else error
+                return f"{why} ({locator}); {in_use}"
+    return in_use
 
 
 def router(
