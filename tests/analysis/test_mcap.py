@@ -124,6 +124,24 @@ def test_cycles_without_a_pose_have_no_motion_and_end_nothing(
     assert {name for _, name, _ in made} == set(mcap.TOPICS)
 
 
+@pytest.mark.parametrize("shown", ["1969-12-31T23:59:59", "2038-01-19T03:14:08", "2250-01-01T00:00:00"])
+@pytest.mark.parametrize("where", ["cycles", "events"])
+def test_a_clock_that_messages_cannot_contain_is_named(
+    recording: Recording, tmp_path: Path, shown: str, where: str
+) -> None:
+    """As on a machine without a battery-backed clock, or whose clock was set wrongly."""
+    if where == "cycles":
+        wall = recording.wall.copy()
+        wall[7] = np.datetime64(shown)
+        strange = recording._replace(wall=wall)
+    else:
+        line = recording.events[-1]._replace(wall=np.datetime64(shown, "ns"))
+        strange = recording._replace(events=[*recording.events, line])
+    with pytest.raises(ServiceError, match=f"the clock showed {shown}; .* export to CSV or Parquet"):
+        mcap.write(strange, tmp_path / "a.mcap")
+    assert not list(tmp_path.iterdir())
+
+
 def test_modes_and_faults_are_diagnostics(recording: Recording, exported: Path) -> None:
     statuses = [m.status[0] for _, m in by_mcap(exported)["/diagnostics"]]
     assert [(s.name, s.message) for s in statuses] == [("trirail: mode", "moving"), ("trirail: fault", FAULT.message)]

@@ -57,6 +57,8 @@ OK, ERROR = 0, 2
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 BLOCK_ROWS = 2000
 """Number of cycles that are converted together."""
+FIRST, LAST = np.datetime64(0, "s"), np.datetime64((1 << 31) - 1, "s")
+"""Earliest and latest time of a message."""
 Message = tuple[int, str, Any]
 """Wall-clock time [ns], topic and message."""
 
@@ -65,8 +67,9 @@ def write(recording: Recording, path: Path) -> int:
     """Write a recording as one MCAP file; return the number of messages.
 
     Each message has the wall-clock time of the record or the log line from which it is made. Raises ServiceError if the
-    file already exists or cannot be written, or if the recording has no configuration.
+    file already exists or cannot be written, if the recording has no configuration, or if its clock was not set.
     """
+    _check_clock(recording)
     settings = provenance.configuration(recording.texts)
     if settings is None:
         raise ServiceError(f"{recording.name}: MCAP needs the configuration, which this recording does not contain")
@@ -202,6 +205,18 @@ def _header(wall: int, frame: str) -> Any:
 def _turn(angle: float) -> Any:
     """Return the quaternion of a rotation about z."""
     return Quaternion(0.0, 0.0, float(np.sin(angle / 2.0)), float(np.cos(angle / 2.0)))
+
+
+def _check_clock(recording: Recording) -> None:
+    """Raise ServiceError if the recording has a time that messages of ROS 2 cannot contain: their seconds are int32."""
+    cycles = (recording.wall.min(), recording.wall.max()) if len(recording.wall) else ()
+    walls = [*cycles, *(line.wall for line in recording.events)]
+    for wall in (min(walls), max(walls)) if walls else ():
+        if not FIRST <= wall <= LAST:
+            raise ServiceError(
+                f"{recording.name}: the clock showed {str(wall)[:19]}; messages of ROS 2 can have times from 1970 to "
+                "2038, so export to CSV or Parquet instead"
+            )
 
 
 def _nanoseconds(walls: NDArray[np.datetime64]) -> list[int]:
