@@ -2,9 +2,10 @@
 
 PYTHON ?= python3
 VENV := .venv
+INSTALLED := $(VENV)/.installed
 READY := $(VENV)/.ready
 
-.PHONY: demo check test test-all test-side-by-side test-alone hil explore chaos soak ci-packages bench screenshots clean
+.PHONY: demo check test test-all test-side-by-side test-alone hil hil-ready explore chaos soak ci-packages bench screenshots clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -51,14 +52,21 @@ ci-packages:  ## the system's packages for the tests of viewers and unit; those 
 bench: $(READY)  ## all that is measured, under ten minutes, beside the aims; one alone: tools/bench.py --help
 	$(VENV)/bin/python tools/bench.py all $(ARGS)
 
-$(READY): pyproject.toml
+$(INSTALLED): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "trirail needs Python 3.11 or newer: make PYTHON=python3.12 …")'
 	$(PYTHON) tools/check_ruckig.py
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --upgrade "pip>=25.1"
 	$(VENV)/bin/python -m pip install --quiet --editable . --group dev
+	touch $@
+
+$(READY): $(INSTALLED)
 	$(VENV)/bin/python -m trirail.processes.compiling
-	touch $(READY)
+	touch $@
+
+hil-ready: ci-packages $(INSTALLED)  ## what make hil installs and compiles first
+	$(VENV)/bin/python -m pip install --quiet --group hil
+	$(VENV)/bin/python tools/hil.py --install --prepare
 
 PICTURES := tools/pictures
 screenshots: $(READY)  ## every picture of the guides anew, from what runs; needs Chromium and the Rerun viewer

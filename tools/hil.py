@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import signal
 import sys
@@ -28,7 +29,7 @@ import hil_dissector
 import hil_fd
 import hil_second
 from hil_dissector import Dissected
-from hil_machine import ROOT, STEPS, compiling, machine, output_lines, pack
+from hil_machine import ROOT, STEPS, begin_compiling, compiling, machine, output_lines, pack
 from hil_needs import install, last, requirements
 from hil_programs import Failed, changed
 from trirail.config import Config, load
@@ -69,6 +70,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where to leave the logs")
     parser.add_argument("--only", choices=STEPS, help="run only one step: two robots, a robot on CAN FD, or the tests")
     parser.add_argument("--json", action="store_true", help="print one JSON object; progress goes to standard error")
+    parser.add_argument("--prepare", action="store_true", help="only compile what runs in the machine")
     options = parser.parse_args()
 
     signal.signal(signal.SIGTERM, _interrupt)
@@ -79,6 +81,8 @@ def main() -> int:
     try:
         if options.install:
             install(say)
+        if options.prepare:
+            return begin_compiling(Path(os.devnull)).wait()
         kernel = requirements()
         folder = options.keep or Path(tempfile.mkdtemp(prefix="trirail-hil-"))
         folder.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Any
 
 from hil_needs import BIN, MODULES, SEARCH, busybox, last
 from hil_programs import Failed
@@ -50,6 +51,17 @@ finally:
 """
 
 
+def begin_compiling(outcome: Path, **streams: Any) -> subprocess.Popen[bytes]:
+    """Start a process that compiles the kinematics for any x86-64 and writes "well" or "failed" to a file."""
+    return subprocess.Popen(
+        (sys.executable, "-P", "-c", COMPILE, outcome),
+        cwd=ROOT,
+        env=os.environ | PORTABLE | {"NUMBA_CACHE_DIR": str(CACHE)},
+        stdin=subprocess.DEVNULL,
+        **streams,
+    )
+
+
 @contextlib.contextmanager
 def compiling(folder: Path) -> Iterator[None]:
     """Compile the kinematics on the host, in parallel with the context, so that the machine can load them.
@@ -58,14 +70,7 @@ def compiling(folder: Path) -> Iterator[None]:
     """
     (folder / COMPILED).unlink(missing_ok=True)  # it may be left from a previous run
     with (folder / "compile.log").open("wb") as log:
-        process = subprocess.Popen(
-            (sys.executable, "-P", "-c", COMPILE, folder / COMPILED),
-            cwd=ROOT,
-            env=os.environ | PORTABLE | {"NUMBA_CACHE_DIR": str(CACHE)},
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-        )
+        process = begin_compiling(folder / COMPILED, stdout=log, stderr=log)
     try:
         yield
     finally:

@@ -318,7 +318,8 @@ def test_test_frames_are_measured_and_nothing_else_is_sent(interface: str, monke
         found = bus_timing.measure(interface, DEFAULT_TIMING, LOOP, SYNC, SETPOINTS)
         frames = list(other.arrived())
     assert isinstance(found, MeasuredTiming)
-    assert (found.source, found.rate_hz) == ("test frames", 100)
+    assert found.source == "test frames"
+    assert found.rate_hz == pytest.approx(100, rel=0.2)  # of what the kernel's clock shows, on a machine that stalls
     assert found.setpoints_us is not None
     assert found.syncs == 100
     assert {each.identifier for each in frames} == set(TEST_FRAMES)
