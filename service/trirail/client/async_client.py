@@ -69,8 +69,8 @@ class AsyncRobot:
     """Asynchronous context manager for a connection to one robot's service, for the tasks of one event loop.
 
     The arguments, method names and errors are those of trirail.client.client.Robot, which offers the same calls to
-    threads. If you cancel a call that sends a goal, the client stops the goal in case the service has received it. An
-    accepted goal continues even if no task waits for the goal.
+    threads. If you cancel a call that sends a goal, or if no reply arrives, the client stops the goal in case the
+    service has received it. An accepted goal continues even if no task waits for the goal.
     """
 
     def __init__(
