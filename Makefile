@@ -25,11 +25,12 @@ test: check  ## before each commit, five minutes: lint, format, types, import co
 test-all: test-side-by-side test-alone  ## everything that decides: the same with every test and every example
 
 EFFORT ?= 1
+MARKS ?= not alone
 test-side-by-side: check  # one more than there are processors: many of these tests wait
-	$(VENV)/bin/pytest --numprocesses $$(($$(nproc) + 1)) --dist worksteal --effort $(EFFORT) -m "not alone"
+	$(VENV)/bin/pytest --numprocesses $$(($$(nproc) + 1)) --dist worksteal --effort $(EFFORT) -m "$(MARKS)"
 
 test-alone: $(READY)
-	$(VENV)/bin/pytest -m alone
+	$(VENV)/bin/pytest --effort $(EFFORT) -m alone
 
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
 	$(VENV)/bin/python -m pip install --quiet --group hil

@@ -94,7 +94,6 @@ def test_kept_code_that_names_a_class_which_is_no_more_is_compiled_anew(room: Pa
         assert run(code, tmp_path) == "2.0 0"
 
 
-@pytest.mark.core
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 @pytest.mark.parametrize(
     "damage", [lambda content: b"", lambda content: content[:-9], lambda content: bytes(len(content))]
@@ -123,7 +122,6 @@ caching.CacheImpl._locator_classes = [UserProvidedCacheLocator]  # no other fold
 """
 
 
-@pytest.mark.core
 def test_without_a_folder_of_its_own_compiled_code_is_in_one_for_temporary_files(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
