@@ -22,7 +22,7 @@ test test-side-by-side test-alone: export PYTHONDONTWRITEBYTECODE =
 test: check  ## before each commit, five minutes: lint, format, types, import contracts, tests of every room, whole services
 	$(VENV)/bin/pytest --numprocesses auto --dist worksteal --effort 0.1 -m "core or not (slow or viewer or long or alone)"
 
-test-all: test-side-by-side test-alone  ## everything that decides: the same with every test and every example
+test-all: test-side-by-side test-alone  ## the same with every test and every example
 
 EFFORT ?= 1
 MARKS ?= not alone
