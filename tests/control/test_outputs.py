@@ -327,6 +327,26 @@ def test_pulses_keep_their_number_and_width_at_every_override(rig: Rig, rate: fl
     assert np.all(np.diff([cycle for cycle, _ in changes])[::2] == 16)
 
 
+@pytest.mark.parametrize("mark", [{"after_start": 0.0}, {"start": 0.0, "increment": 0.005, "pulse_width": 0.005}])
+@pytest.mark.parametrize("begins", [True, False])
+def test_a_mark_at_the_start_waits_for_the_motion_at_override_0(rig: Rig, mark: dict[str, Any], begins: bool) -> None:
+    """A goal that expires before it has moved has switched nothing."""
+    rig.command("override", 0.0)
+    rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.5, valid_for=0.2, marks=(Mark("valve", **mark),)))
+    rig.cycles(100)
+    assert rig.changes("valve") == []
+    if begins:
+        rig.command("override", 1.0)
+    rig.until(rig.holds, 20_000)
+    rig.cycles(10)
+    moving = np.flatnonzero(np.any(np.diff(rig.poses, axis=0) != 0.0, axis=1))
+    assert bool(len(moving)) == bool(rig.changes("valve")) == begins
+    if begins:
+        cycle, on = rig.changes("valve")[0]
+        assert on
+        assert abs(cycle - (moving[0] + 2)) <= 1
+
+
 def test_a_goals_own_limits_apply_at_every_override(rig: Rig) -> None:
     rig.command("override", 2.0)
     own = OwnLimits(velocity=(0.05, 0.05, 0.5), acceleration=(0.2, 0.2, 1.0), jerk=(2.0, 2.0, 10.0))

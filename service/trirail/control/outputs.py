@@ -160,6 +160,8 @@ def switch(
         # later decision can change the motion within one period.
         here = law_at(law_knots, law_pieces, time + output.delay)[0]
         there = law_at(law_knots, law_pieces, time + period + output.delay)[0]
+        if there == 0.0:
+            continue  # the motion has not begun, since the override is 0
         while output.next < output.end and planned[output.next].s <= (here + there) / 2.0:
             due = planned[output.next]
             _set(words, output, due.on)
