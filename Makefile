@@ -5,7 +5,7 @@ VENV := .venv
 INSTALLED := $(VENV)/.installed
 READY := $(VENV)/.ready
 
-.PHONY: demo check test test-all test-side-by-side test-alone hil hil-ready explore chaos soak ci-packages bench screenshots clean
+.PHONY: demo check test test-all test-part test-side-by-side test-alone hil hil-ready explore chaos soak ci-packages bench screenshots clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -16,21 +16,26 @@ check: $(READY)  ## lint, format, types and import contracts alone
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
-test test-side-by-side test-alone: export PYTHONHASHSEED = 0
+test test-part test-side-by-side test-alone: export PYTHONHASHSEED = 0
 # Where this is set, as in many containers, every worker and every program of a test would compile all modules anew.
-test test-side-by-side test-alone: export PYTHONDONTWRITEBYTECODE =
+test test-part test-side-by-side test-alone: export PYTHONDONTWRITEBYTECODE =
 test: check  ## before each commit, five minutes: lint, format, types, import contracts, tests of every room, whole services
 	$(VENV)/bin/pytest --numprocesses auto --dist worksteal --effort 0.1 -m "core or not (slow or viewer or long or alone)"
 
 test-all: test-side-by-side test-alone  ## the same with every test and every example
 
 EFFORT ?= 1
-MARKS ?= not alone
 test-side-by-side: check  # one more than there are processors: many of these tests wait
-	$(VENV)/bin/pytest --numprocesses $$(($$(nproc) + 1)) --dist worksteal --effort $(EFFORT) -m "$(MARKS)"
+	$(VENV)/bin/pytest --numprocesses $$(($$(nproc) + 1)) --dist worksteal --effort $(EFFORT) -m "not alone"
 
 test-alone: $(READY)
-	$(VENV)/bin/pytest --effort $(EFFORT) -m alone
+	$(VENV)/bin/pytest -m alone
+
+PART ?= 1/4
+test-part: $(READY)  ## a part of what make test leaves out: make test-part PART=2/4
+	$(VENV)/bin/pytest --numprocesses $$(($$(nproc) + 1)) --dist worksteal --effort 0.1 --part $(PART) \
+		-m "(slow or viewer or long) and not (core or alone)"
+	$(VENV)/bin/pytest --part $(PART) -m alone
 
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
 	$(VENV)/bin/python -m pip install --quiet --group hil

@@ -38,7 +38,7 @@ os.environ["STATE_DIRECTORY"] = _STATE.name  # the poses that somebody has taugh
 for _setting in ("TRIRAIL_ROBOT", "TRIRAIL_CONNECT", "TRIRAIL_TLS"):  # the tests start robots of their own
     os.environ.pop(_setting, None)
 
-pytest_plugins = ["caused_messages", "generated", "parsed_eds", "warm"]
+pytest_plugins = ["caused_messages", "generated", "parsed_eds", "parts", "warm"]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells have it for what runs in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
