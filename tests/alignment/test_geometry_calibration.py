@@ -159,6 +159,56 @@ def test_lost_swapped_and_wrong_marks_are_named_and_change_nothing(seed: int, na
     assert misses(made, found, unseen(task, 10)).max() < 1.5
 
 
+SMALL_FIELD = (2448.0, 2048.0)
+
+
+@pytest.mark.parametrize("how", ["late", "late from look 8", "names exchanged from look 8", "one camera late"])
+@pytest.mark.parametrize("field", [FIELD, SMALL_FIELD])
+@pytest.mark.generated(*range(12))
+def test_wrong_pictures_are_refused_with_the_residual_and_what_to_check(seed: int, field: Pair, how: str) -> None:
+    name = sorted(STAGES)[seed % 3]
+    made, task = stage(name, seed, noise=0.05)
+    made.field, rng = field, np.random.default_rng(seed)
+    made.views = {mark: wide_camera(rng, at, field=field) for mark, at in PART.items()}
+    taken, take = list[dict[str, Pair]](), made.look
+
+    def wrong() -> dict[str, Pair]:
+        taken.append(now := take())
+        before = taken[max(0, len(taken) - 2)]
+        if how == "one camera late":
+            return {mark: seen[mark] for mark, seen in (("left", before), ("right", now)) if mark in seen}
+        if how == "late" or (how == "late from look 8" and len(taken) > 7):
+            return before
+        if len(taken) > 7:
+            return {mark: now[other] for mark, other in (("left", "right"), ("right", "left")) if other in now}
+        return now
+
+    made.look = wrong  # type: ignore[method-assign]
+    with pytest.raises(AlignmentError, match=r"check that|check the names") as refused:
+        made.drive(calibrate_geometry(task._replace(field=field)))
+    assert refused.value.fault is AlignmentFault.STILL
+
+
+@pytest.mark.generated(*range(6))
+def test_names_that_are_exchanged_in_one_camera_from_some_look_on_are_refused(seed: int) -> None:
+    """The fit explains either names, since the camera is the same."""
+    part: dict[str, Pair] = {"left": (-0.06, 0.0), "right": (-0.058, 0.001)}
+    made, task = stage(sorted(STAGES)[seed % 3], seed, noise=0.05, part=part)
+    made.views = dict.fromkeys(part, made.views["left"])
+    take, looks = made.look, 0
+
+    def exchanged() -> dict[str, Pair]:
+        nonlocal looks
+        looks += 1
+        now = take()
+        return now if looks <= 7 else {mark: now[o] for mark, o in (("left", "right"), ("right", "left")) if o in now}
+
+    made.look = exchanged  # type: ignore[method-assign]
+    with pytest.raises(AlignmentError, match="exchanged in looks 1, 2, 3, 4, 5, 6, 7, compared") as refused:
+        made.drive(calibrate_geometry(task._replace(views=dict.fromkeys(part, "camera"))))
+    assert refused.value.fault is AlignmentFault.SWAPPED
+
+
 @settings(max_examples=6)  # each is a whole calibration of the stage
 @given(
     name=names,

@@ -129,6 +129,24 @@ def test_a_stage_finds_its_geometry_and_writes_a_configuration_when_it_is_told_t
 
 
 @pytest.mark.slow
+def test_pictures_that_are_one_late_end_with_an_error_and_change_no_file(
+    stage: tuple[Path, str], tmp_path: Path
+) -> None:
+    given, out, camera = options(stage, tmp_path), tmp_path / "new.toml", tmp_path / "camera.json"
+    script = tmp_path / "marks.py"
+    late = MARKS.replace("    for _ in", "    last = None\n    for _ in")
+    late = late.replace("print(json.dumps(seen)", "last, seen = seen, last or seen\n        print(json.dumps(seen)")
+    script.write_text(late, encoding="utf-8")
+    more = ["24" if each == "14" else each for each in given]
+    done = warm.trirail("align", "geometry", *more, "--out", out, "--yes")
+    assert done.returncode == 1
+    assert "the marks do not follow the stage: the residual is" in " ".join(done.stderr.split())
+    assert "usual" in done.stderr
+    assert not out.exists()
+    assert not camera.exists()
+
+
+@pytest.mark.slow
 def test_what_is_not_the_configuration_of_the_service_is_refused_before_a_move(
     stage: tuple[Path, str], tmp_path: Path
 ) -> None:

@@ -53,6 +53,13 @@ MAX_LEFT_OUT = 2
 MAX_START_RESIDUAL_PX, MAX_START_SHARE = 1.0, 0.01
 """Greatest residual of correct first looks: in pixels, and as a fraction of the travel of a mark. The higher limit
 applies."""
+MAX_NOISE_PX, MAX_NOISE_SHARE = 1.0, 1e-3
+"""Greatest residual of correct looks: in pixels, and as a fraction of the travel of a mark. The higher one applies. In
+simulations, errors of 24 µm that no geometry explains, or a wrong model of the lens, cause a fraction of at most
+0.45e-3. Late pictures or exchanged names cause a fraction of at least 2.7e-3."""
+MAX_SWAPPED_SHARE = 0.1
+"""Greatest fraction of looks in which names of marks may be exchanged. With more, either names could be the wrong
+ones."""
 SYSTEMATIC = 1.5
 """Ratio of residuals to picture noise above which the looks have systematic errors."""
 MIN_NAMED_SHARE = 0.3
@@ -350,6 +357,15 @@ def solve(
     """
     known = tuple(look._replace(marks={n: u for n, u in look.marks.items() if n in model.places}) for look in looks)
     fit = fit_stage(model, known)
+    _check_noise(fit, known)
+    outliers = _outliers(fit, known)
+    swapped = sorted({each.look for each in outliers if each.swapped_with})
+    if len(swapped) > MAX_SWAPPED_SHARE * len(known):
+        raise AlignmentError(
+            AlignmentFault.SWAPPED,
+            f"the names of marks are exchanged in looks {', '.join(map(str, swapped))}, compared with the other looks; "
+            "calibrate again, and use coded marks if this happens repeatedly",
+        )
     state, geometry = model.state(fit.unknowns), model.geometry(fit.unknowns)
     deviations = model.doubts * np.sqrt(
         np.einsum("ij,jk,ik->i", model.basis, fit.covariance[: model.legs, : model.legs], model.basis)
@@ -371,10 +387,31 @@ def solve(
         fit.noise,
         picture_noise,
         structs.replace(calibrated_cameras(model, fit, known, task.looks), approach=plain_approach(task.approach)),
-        _outliers(fit, known),
+        outliers,
         known,
         fit_residual_map(geometry, task.room, state, model.view_of, used) if is_systematic else None,
     )
+
+
+def _check_noise(fit: StageFit, looks: Sequence[StageLook]) -> None:
+    """Raise AlignmentError if the marks are farther from their computed pixels than on any real stage.
+
+    The fit finds outliers by comparing the looks with each other, so that it cannot tell if most of them are wrong.
+    """
+    tracks: dict[str, list[Floats]] = {}
+    for (number, name), residual in zip(list_marks(looks), fit.residuals, strict=True):
+        tracks.setdefault(name, []).append(looks[number].marks[name] - residual)
+    travel = max(float(np.ptp(track, axis=0).max()) for track in tracks.values())
+    limit = max(MAX_NOISE_PX, MAX_NOISE_SHARE * travel)
+    if fit.noise > limit:
+        raise AlignmentError(
+            AlignmentFault.STILL,
+            f"the marks do not follow the stage: the residual is {fit.noise:.1f} pixels, the limit {limit:.1f}, and "
+            "0.05 to 0.3 are usual; check that each look takes new pictures, with --wait if the camera is late, and "
+            "that no cameras or names of marks are exchanged",
+            value=fit.noise,
+            limit=limit,
+        )
 
 
 def _undetermined(model: StageModel, fit: StageFit) -> tuple[str, ...]:

@@ -23,7 +23,8 @@ from trirail.errors import AlignmentError, AlignmentFault, KinematicsError
 OUTLIER_DEVIATIONS = 6.0
 """Distance of a mark from its computed pixel above which the observation is an outlier, in standard deviations."""
 MIN_NOISE_PX = 0.01
-MAX_OUTLIER_SHARE = 0.3
+MAX_OUTLIER_SHARE, MAX_MARK_OUTLIER_SHARE = 0.3, 0.5
+"""Greatest fraction of outliers among all observations, and among those of one mark."""
 TOLERANCE = 1e-12
 MAX_EVALUATIONS = 100
 MAX_ROUNDS = 30
@@ -82,6 +83,14 @@ def fit_stage(
                 f"{len(now) - int(now.sum())} of {len(now)} marks are far from where any stage would put them; check "
                 "that each look takes a new picture, and the names of the marks",
             )
+        for name in model.places:
+            own = now[[mark == name for _, mark in marks]]
+            if own.mean() < 1.0 - MAX_MARK_OUTLIER_SHARE:
+                raise AlignmentError(
+                    AlignmentFault.STILL,
+                    f"mark {name} is far from where any stage would put it in {len(own) - int(own.sum())} of "
+                    f"{len(own)} looks; check that its camera takes a new picture at each look, and its name",
+                )
         doubt = max(1.0, float(np.sqrt(np.mean(unknowns[: model.legs] ** 2))))
         basis = _determined(model, model.jacobian(unknowns, looks)[now] / noise * doubt)
         unknowns[: model.legs] = basis[: model.legs] @ (basis[: model.legs].T @ unknowns[: model.legs])
