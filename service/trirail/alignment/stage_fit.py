@@ -72,10 +72,13 @@ def fit_stage(
         unknowns = _minimise(model, looks, unknowns, used, free, 1.0, 1.0, robust=False)
         return _result(model, looks, unknowns, used, free, 1.0)
     unknowns = _minimise(model, looks, unknowns, used, np.eye(model.size), 1.0, 1.0, robust=True)
-    noise = math.inf
+    noise, free = math.inf, model.size
     for _ in range(MAX_ROUNDS):
         away = np.linalg.norm(model.residuals(unknowns, looks), axis=1)
-        last, noise = noise, max(float(np.median(away[used])) / RAYLEIGH_MEDIAN, MIN_NOISE_PX)
+        # The fit brings the computed pixels nearer to the observed ones: few looks leave less than the noise.
+        count = 2 * int(used.sum())
+        share = math.sqrt(count / max(count - free, 1))
+        last, noise = noise, max(share * float(np.median(away[used])) / RAYLEIGH_MEDIAN, MIN_NOISE_PX)
         now = away <= OUTLIER_DEVIATIONS * noise
         if now.mean() < 1.0 - MAX_OUTLIER_SHARE:
             raise AlignmentError(
@@ -93,6 +96,7 @@ def fit_stage(
                 )
         doubt = max(1.0, float(np.sqrt(np.mean(unknowns[: model.legs] ** 2))))
         basis = _determined(model, model.jacobian(unknowns, looks)[now] / noise * doubt)
+        free = basis.shape[1]
         unknowns[: model.legs] = basis[: model.legs] @ (basis[: model.legs].T @ unknowns[: model.legs])
         is_falling, is_same = noise < MIN_NOISE_SHARE * last, np.array_equal(now, used)
         used = now
