@@ -178,7 +178,9 @@ def write(text: str, output: Path | None) -> None:
         print(text, end="")
         return
     try:
-        output.write_text(text, encoding="utf-8")
+        files.create(output, text.encode())
+    except FileExistsError:
+        raise CalibrationError(f"{output} already exists: choose another file") from None
     except OSError as error:
         raise CalibrationError(f"cannot write {output}: {error.strerror}") from error
 
@@ -201,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--config", type=Path, default=config.SIM, help="configuration with the starting geometry (%(default)s)"
     )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="file for the section; standard output if absent")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="new file for the result; else standard output")
     parser.add_argument(
         "--map", action="store_true", help="write a map of the errors that the geometry does not explain"
     )

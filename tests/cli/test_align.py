@@ -66,9 +66,9 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
         robot.enable()
         robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN)
     marks = ("--program", f"{sys.executable} {script} {locator} {part}", "--connect", locator)
-    kept.write_text("taught", encoding="utf-8")
+    kept.write_text(taught := '{"calibration": "taught"}', encoding="utf-8")
     told = trirail("align", "calibrate", kept, *marks).stdout
-    assert kept.with_name("camera.json.old").read_text(encoding="utf-8") == "taught"
+    assert kept.with_name("camera.json.old").read_text(encoding="utf-8") == taught
     assert "camera.json.old" in told
     assert "look 7 of 7" in told
     assert "3.9" in told  # µm a pixel
@@ -385,6 +385,28 @@ def test_a_folder_that_is_not_there_is_known_before_the_stage_moves(words: tuple
         app(["align", *map(str, words), "--program", "true"])
 
 
+@pytest.mark.parametrize("words", [("calibrate",), ("geometry", str(SIM), "--field", "9", "9", "--calibration")])
+@pytest.mark.parametrize(
+    "content", [SIM.read_text(encoding="utf-8"), '{"poses": {"home": [0, 0, 0]}}', "[]", "u,v\n1,2\n", "\udcff\0"]
+)
+def test_a_file_of_another_kind_is_not_replaced_by_a_calibration(
+    words: tuple[str, ...], content: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_bytes(written := content.encode(errors="surrogateescape"))
+    with pytest.raises(TrirailError, match=f"{file} already exists and is not a camera calibration"):
+        app(["align", *words, str(file), "--program", "true"])
+    assert file.read_bytes() == written
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("content", ["", '{"version": 1, "calibration": {"views"', '{"calibration": 7}'])
+def test_a_damaged_calibration_may_be_replaced(content: str, tmp_path: Path) -> None:
+    file = tmp_path / "camera.json"
+    file.write_text(content, encoding="utf-8")
+    calibration_file.check_replaceable(file)
+
+
 @pytest.mark.parametrize("out", [False, True])
 def test_cameras_of_a_geometry_are_written_beside_its_configuration(
     out: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -399,7 +421,7 @@ def test_cameras_of_a_geometry_are_written_beside_its_configuration(
     def refuse(path: Path) -> None:
         raise TrirailError(f"cameras in {path}")
 
-    monkeypatch.setattr(calibration_file, "check_folder", refuse)
+    monkeypatch.setattr(calibration_file, "check_replaceable", refuse)
     words = ["--out", str(tmp_path / "new" / "new.toml")] if out else []
     expected = tmp_path / ("new" if out else "stage") / "camera.json"
     with pytest.raises(TrirailError, match=f"^cameras in {expected}$"):

@@ -107,7 +107,7 @@ def test_a_stage_finds_its_geometry_and_writes_a_configuration_when_it_is_told_t
     assert "nothing is written" in asked.stdout
     assert not out.exists()
     assert not camera.exists()
-    camera.write_text("taught", encoding="utf-8")
+    camera.write_text(taught := '{"calibration": "taught"}', encoding="utf-8")
     done = warm.trirail("align", "geometry", *given, "--out", out, "--yes", "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
@@ -122,7 +122,7 @@ def test_a_stage_finds_its_geometry_and_writes_a_configuration_when_it_is_told_t
     kept = calibration_file.read(camera)
     assert kept.geometry == as_built.geometry_of(geometry(written.geometry))
     assert not kept.is_of_geometry(as_built.geometry_of(geometry(service.geometry)))
-    assert camera.with_name("camera.json.old").read_text(encoding="utf-8") == "taught"
+    assert camera.with_name("camera.json.old").read_text(encoding="utf-8") == taught
     # The service still has the old geometry: that is said, and the calibration does not count as confirmed.
     checked = warm.trirail("align", "check", camera, *given[8:])
     assert "another geometry" in checked.stderr

@@ -431,7 +431,11 @@ def test_other_errors_are_one_line(measured: Path, tmp_path: Path, capsys: pytes
     assert "the angle noise is 0.0" in complaint(str(measured), "--angle-noise", "0")
     assert "no geometry fits" in complaint(str(measured), "--position-noise", "1e-6", "--angle-noise", "1e-6")
     assert re.search(r": line \d+: ", complaint(str(measured), "--deg"))
-    assert "cannot write" in complaint(str(measured), "--output", str(tmp_path))
+    assert "cannot write" in complaint(str(measured), "--output", str(tmp_path / "none" / "geometry.toml"))
+    robot = tmp_path / "robot.toml"
+    robot.write_text(SIM, encoding="utf-8")
+    assert "robot.toml already exists: choose another file" in complaint(str(measured), "--output", str(robot))
+    assert robot.read_text(encoding="utf-8") == SIM
     binary = tmp_path / "binary.csv"
     binary.write_bytes(b"\xff\xfe\x00x")
     assert "not text in UTF-8" in complaint(str(binary))

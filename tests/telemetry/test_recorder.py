@@ -164,7 +164,7 @@ def test_a_service_that_does_not_start_leaves_no_recording(
 
 def test_a_file_asked_for_by_name_is_written_anew(tmp_path: Path) -> None:
     path = tmp_path / "mine.rrd"
-    path.write_text("old")
+    path.write_bytes(b"RRF2old")
     recording = recorder(tmp_path / "elsewhere", path=path)
     feed(recording, made.records(0.1))
     recording.close()
@@ -202,6 +202,17 @@ def test_a_file_that_another_recorder_is_writing_is_not_begun_anew(tmp_path: Pat
     assert len(read(first.path)[0]) == 200
     recorder(tmp_path, path=first.path).close()
     assert chunks(first.path, "/record") == []
+
+
+def test_a_file_of_another_kind_is_not_recorded_to(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_bytes(content := SIM.read_bytes())
+    with pytest.raises(ServiceError, match=r"robot\.toml already exists and is not a recording; name another file"):
+        recorder(tmp_path, path=path)
+    assert path.read_bytes() == content
+    path.write_bytes(b"")
+    recorder(tmp_path, path=path).close()
+    assert path.read_bytes().startswith(b"RRF2")
 
 
 def test_a_live_port_in_use_is_refused(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def calibrate(
         raise TrirailError(
             "--lens radial needs --centre U V, the pixel on the optical axis: usually the centre of the picture"
         )
-    calibration_file.check_folder(file)
+    calibration_file.check_replaceable(file)
     moves = calibration_moves(lens, by, notation.radians(angle, False))
     with source.open_source() as (look, known), service.open() as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known

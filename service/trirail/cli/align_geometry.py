@@ -86,7 +86,7 @@ def geometry(
     if out is not None:
         config_edit.check_new_file(out)
     calibration = calibration or (out or config).with_name("camera.json")
-    calibration_file.check_folder(calibration)
+    calibration_file.check_replaceable(calibration)
     way = approach[0], approach[1], notation.radians(approach[2], False)
     with source.open_source() as (look, known), service.open() as robot:
         _check_same(settings, config, robot)

@@ -62,10 +62,18 @@ def write(
         raise FileError(f"cannot write {path}: {error.strerror}") from error
 
 
-def check_folder(path: Path) -> None:
-    """Raise FileError if there is no folder for a calibration file, so that this is known before the stage moves."""
+def check_replaceable(path: Path) -> None:
+    """Raise FileError unless a calibration can be written to a file, so that this is known before the stage moves.
+
+    Its folder must exist, and an existing file must be a calibration, which may be damaged.
+    """
     if not path.parent.is_dir():
         raise FileError(f"{path}: there is no folder {path.parent}")
+    if not path.exists():
+        return
+    content = files.text(path, "replace").strip()
+    if content and not (content.startswith("{") and '"calibration"' in content):
+        raise FileError(f"{path} already exists and is not a camera calibration; choose another file, or remove it")
 
 
 def keep_old(path: Path) -> Path | None:

@@ -36,13 +36,13 @@ from trirail.telemetry.journal import EVENTS, JSON, REQUESTS, WORDS, Line
 from trirail.telemetry.provenance import SOFTWARE
 from trirail.telemetry.recorded_inputs import decode_input
 from trirail.telemetry.recording import Recording
+from trirail.telemetry.retention import MAGIC
 from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE
 
 # Structure of an RRD file: Rerun's crate re_log_encoding, src/rrd/frames.rs.
-_MAGIC = b"RRF2"
 _FILE_HEADER = 12
 """Size of the file header, which contains magic number, version and options [bytes]."""
 _MESSAGE_HEADER = struct.Struct("<QQ")
@@ -226,8 +226,8 @@ def _complete_length(path: Path) -> int:
     the data. A message that extends into these bytes is not complete.
     """
     with files.open_regular(path) as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
-            raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
+        if file.read(len(MAGIC)) != MAGIC:
+            raise ServiceError(f"{path}: not a recording: an RRD file begins with {MAGIC.decode()}")
         if os.fstat(file.fileno()).st_size < _FILE_HEADER:
             raise ServiceError(f"{path}: cut off in its header: the recording is empty")
         size, end = os.fstat(file.fileno()).st_size, _FILE_HEADER

@@ -25,7 +25,7 @@ from trirail.telemetry.contents import Contents
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.journal import EVENTS, REQUESTS
 from trirail.telemetry.readout import ReadoutState
-from trirail.telemetry.retention import STAMP, name_in_order
+from trirail.telemetry.retention import MAGIC, STAMP, name_in_order
 from trirail.telemetry.rotation import RotatedFiles, claim
 from trirail.telemetry.sinks import RESERVE, Relay, free_space, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
@@ -434,15 +434,18 @@ def _remedy(error: OSError) -> str:
 
 
 def _overwrite(path: Path) -> Path:
-    """Create an empty file, or truncate an existing file.
+    """Create an empty file, or truncate an existing recording.
 
     Raises FileError if the file is not a regular file (opening a FIFO would wait for a reader), and ServiceError if a
-    recorder is writing the file.
+    recorder is writing the file, or if it is not a recording.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         files.check(path)
         if retention.is_being_written(path):
             raise ServiceError(f"{path} is being written, perhaps by another service; name another file")
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) not in (b"", MAGIC):
+                raise ServiceError(f"{path} already exists and is not a recording; name another file")
     path.open("wb").close()
     return path

@@ -19,6 +19,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
 
+MAGIC = b"RRF2"
+"""First bytes of an RRD file: Rerun's crate re_log_encoding, src/rrd/frames.rs."""
 BLACK_BOX = "fault-"
 """Prefix of the names of black boxes."""
 _PART = re.compile(r"-part\d+(-\d+)?$")
