@@ -41,7 +41,8 @@ class StageFit(NamedTuple):
 
     unknowns: Floats
     covariance: Floats
-    """Covariance of the unknowns, (size, size); zero for combinations that keep their configured values."""
+    """Covariance of the unknowns, (size, size). Combinations that keep their configured values have the standard
+    deviations of the drawings."""
     determined: Floats
     """Orthonormal basis of the combinations of leg unknowns that the looks determine, (legs, K)."""
     noise: float
@@ -120,7 +121,10 @@ def _result(
     noise = float(np.sqrt((residuals[used] ** 2).sum() / freedom))
     drawings = noise / doubt * np.eye(legs, model.size) @ basis
     covariance = _covariance(model.jacobian(unknowns, looks)[used], basis, drawings, noise)
-    return StageFit(unknowns, covariance, basis[:legs, : basis.shape[1] - (model.size - legs)], noise, residuals, used)
+    determined = basis[:legs, : basis.shape[1] - (model.size - legs)]
+    # A parameter with a small share of an undetermined combination is as uncertain as this share of the drawings.
+    covariance[:legs, :legs] += doubt**2 * (np.eye(legs) - determined @ determined.T)
+    return StageFit(unknowns, covariance, determined, noise, residuals, used)
 
 
 def _covariance(jacobian: Floats, basis: Floats, drawings: Floats, noise: float) -> Floats:
