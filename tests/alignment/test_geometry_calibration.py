@@ -415,6 +415,23 @@ def test_impossible_arguments_are_refused_before_a_move(change: dict[str, object
     assert made.motions == 0
 
 
+@pytest.mark.parametrize("wrong", [1e20, -1e155, 1e300])
+@pytest.mark.parametrize("number", [1, 4, 20])
+def test_an_absurd_pixel_is_refused_at_its_look(number: int, wrong: float) -> None:
+    made, task = stage("uvw", 1, noise=0.05)
+    take, looks = made.look, 0
+
+    def look() -> dict[str, Pair]:
+        nonlocal looks
+        looks += 1
+        return take() if looks != number else {"left": (wrong, 0.0)}
+
+    made.look = look  # type: ignore[method-assign]
+    with pytest.raises(AlignmentError, match=r"look returned .* for mark 'left': expected two pixels within ±1e7"):
+        made.drive(calibrate_geometry(task))
+    assert looks == number
+
+
 @pytest.mark.parametrize("name", sorted(STAGES))
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_cameras_are_checked_within_the_travel_from_wherever_the_stage_stands(name: str, side: float) -> None:

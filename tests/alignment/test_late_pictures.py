@@ -172,7 +172,15 @@ BAD_TASKS = {
     "distance": (-1.0, math.nan, None),
     "corrections": (-1, 1.5, "3", None),
     "approach": ((1.0, 2.0), (math.nan, 0.0, 0.0), "far", 3.0, ("a", "b", "c")),
-    "targets": (None, 3, {"left": None}, {"left": (math.nan, 1.0)}, {"left": (1.0, 2.0, 3.0)}, {"nobody": (1.0, 2.0)}),
+    "targets": (
+        None,
+        3,
+        {"left": None},
+        {"left": (1e155, 0.0)},
+        {"left": (math.nan, 1.0)},
+        {"left": (1.0, 2.0, 3.0)},
+        {"nobody": (1.0, 2.0)},
+    ),
     "calibration": (None, "camera.json", {}),
 }
 BAD_CALIBRATIONS = {
@@ -217,6 +225,8 @@ def test_a_calibration_with_an_impossible_argument_moves_nothing(what: str, valu
         {"left": None},
         {"left": "ab"},
         {"left": (math.inf, 0.0)},
+        {"left": (1e20, 0.0)},
+        {"left": (0.0, -1e155)},
         {3: (1.0, 2.0)},
     ],
 )

@@ -193,7 +193,7 @@ def test_a_target_without_a_calibration_is_named() -> None:
 def test_pictures_that_show_no_number_are_refused() -> None:
     stage, calibration, targets = ready(9)
     stage.look = lambda: {**targets, "left": (math.nan, 1.0)}  # type: ignore[method-assign]
-    with pytest.raises(AlignmentError, match="finite pixels"):
+    with pytest.raises(AlignmentError, match="two pixels within"):
         stage.drive(align(AlignmentTask(calibration, targets)))
 
 

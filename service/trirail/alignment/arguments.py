@@ -9,11 +9,14 @@ from typing import NoReturn
 from trirail.alignment.images import LENSES, Pair
 from trirail.errors import RefusalCode, RefusedError
 
+MAX_PIXEL = 1e7
+"""Greatest pixel coordinate that is accepted. No picture is that large, and fits with much greater ones overflow."""
+
 
 def parse_pixel(value: object) -> Pair | None:
-    """Return two finite numbers as a pair of Python floats; None for any other value."""
+    """Return two numbers of at most MAX_PIXEL as a pair of Python floats; None for any other value."""
     pair = parse_numbers(value, 2)
-    return None if pair is None else (pair[0], pair[1])
+    return None if pair is None or max(map(abs, pair)) > MAX_PIXEL else (pair[0], pair[1])
 
 
 def parse_numbers(value: object, count: int) -> tuple[float, ...] | None:
@@ -87,7 +90,7 @@ def check_lens(lens: object, centre: object) -> None:
         return
     for each in centre.values() if isinstance(centre, Mapping) else (centre,):
         if parse_pixel(each) is None:
-            _refuse(each, "centre", "two finite pixels (u, v)")
+            _refuse(each, "centre", "two pixels (u, v) within ±1e7")
 
 
 def check_targets(value: object) -> None:
@@ -96,7 +99,7 @@ def check_targets(value: object) -> None:
         _refuse(value, "targets", "{mark: (u, v)} in pixels")
     for name, pixel in value.items():
         if parse_pixel(pixel) is None:
-            _refuse(pixel, f"the target of mark {name!r:.60}", "two finite pixels (u, v)")
+            _refuse(pixel, f"the target of mark {name!r:.60}", "two pixels (u, v) within ±1e7")
 
 
 def _parse_number(value: object) -> float | None:

@@ -66,7 +66,8 @@ def validate_picture(picture: Observation) -> Observation:
         pixel = parse_pixel(value)
         if not isinstance(name, str) or pixel is None:
             raise AlignmentError(
-                AlignmentFault.MISSING, f"look returned {value!r:.60} for mark {name!r:.60}: expected two finite pixels"
+                AlignmentFault.MISSING,
+                f"look returned {value!r:.60} for mark {name!r:.60}: expected two pixels within ±1e7",
             )
         plain[name] = pixel
     return picture._replace(marks=plain)
