@@ -9,6 +9,7 @@ import queue
 import subprocess
 import sys
 import threading
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ import warm
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
-from trirail.cli import mark_source
+from trirail.cli import align_command, mark_source
 from trirail.cli.app import app
 from trirail.cli.mark_source import MarkSource
 from trirail.client import calibration_file
@@ -405,6 +407,16 @@ def test_a_damaged_calibration_may_be_replaced(content: str, tmp_path: Path) -> 
     file = tmp_path / "camera.json"
     file.write_text(content, encoding="utf-8")
     calibration_file.check_replaceable(file)
+
+
+def test_the_limit_of_a_correction_with_another_geometry_is_told_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    """A correction is only shortened beyond twice the moves, which for a calibration of the geometry never happens."""
+    view = CameraView((0.0, 0.0), (0.0, 0.0), ((1e5, 0.0), (0.0, 1e5)))
+    known = CameraCalibration({"m": view}, {}, 0.1, (), (), {}, confirmed=True)
+    kept = calibration_file.CalibrationFile(1, "uvw", datetime.now(UTC), known, {}, "01234567")
+    assert not align_command._checked_calibration(kept, Path("camera.json"), "89abcdef").confirmed
+    said = " ".join(capsys.readouterr().err.split())
+    assert "until then, a correction moves no mark farther than twice the moves of the calibration" in said
 
 
 @pytest.mark.parametrize("out", [False, True])

@@ -231,8 +231,7 @@ def _checked_calibration(kept: CalibrationFile, file: Path, geometry: str) -> Ca
         return kept.calibration
     terminal.print_error(
         f"{file} was made with another geometry of the stage: calibrate again, or let an alignment confirm the "
-        "calibration; "
-        "until then, the first correction of an alignment is shortened"
+        "calibration; until then, a correction moves no mark farther than twice the moves of the calibration"
     )
     return msgspec.structs.replace(kept.calibration, confirmed=False)
 
