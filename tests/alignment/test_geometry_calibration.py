@@ -398,6 +398,31 @@ def test_a_map_is_offered_for_errors_that_no_geometry_explains_where_it_helps_at
     assert few.map is None
 
 
+class UnevenStage(BuiltStage):
+    """A stage with errors of 8 µm and 0.1 mrad that no geometry explains."""
+
+    @property
+    def true_pose(self) -> Triple:
+        x, y, phi = super().true_pose
+        return x + 8e-6 * math.sin(x / 4e-3), y + 6e-6 * math.cos(y / 5e-3), phi + 1e-4 * math.sin((x + y) / 7e-3)
+
+
+@pytest.mark.parametrize("name", sorted(STAGES))
+@pytest.mark.generated(*range(4))
+def test_only_corrections_beyond_their_uncertainty_are_significant(seed: int, name: str) -> None:
+    """Those of a stage that is as configured are noise, and errors of 8 µm that no geometry explains are no legs."""
+    made, task = stage(name, seed, noise=0.1)
+    made.__class__ = UnevenStage
+    assert not made.drive(calibrate_geometry(task._replace(looks=4))).is_significant
+    made, task = stage(name, seed, noise=0.1)
+    made.built, made.scales = task.start, np.zeros(3)
+    assert not made.drive(calibrate_geometry(task)).is_significant
+    made.built = built_otherwise(task.start, np.random.default_rng(seed), 1e-3, 3e-3)
+    found = made.drive(calibrate_geometry(task._replace(looks=4)))
+    assert found.is_significant
+    assert found.change > 1e-6
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -55,7 +55,7 @@ from trirail.client.stage_as_built import built_otherwise
 from trirail.config import SIM, geometry, load
 from trirail.kinematics.robot import forward
 robot = geometry(load(SIM.with_name("uvw.toml")).geometry)
-built = built_otherwise(robot, np.random.default_rng(1), 50e-6, 1e-4)
+built = built_otherwise(robot, np.random.default_rng(1), 4e-4, 1e-3)
 scales = 1.0 + np.array([1e-4, -2e-4, 1e-4])
 middle = (4672.0, 3500.0)
 rng = np.random.default_rng(2)
@@ -142,6 +142,20 @@ def test_pictures_that_are_one_late_end_with_an_error_and_change_no_file(
     assert done.returncode == 1
     assert "the marks do not follow the stage: the residual is" in " ".join(done.stderr.split())
     assert "usual" in done.stderr
+    assert not out.exists()
+    assert not camera.exists()
+
+
+@pytest.mark.slow
+def test_a_stage_that_is_as_configured_keeps_its_configuration(stage: tuple[Path, str], tmp_path: Path) -> None:
+    given, out, camera = options(stage, tmp_path), tmp_path / "new.toml", tmp_path / "camera.json"
+    exact = MARKS.replace("np.random.default_rng(1), 4e-4, 1e-3", "np.random.default_rng(1), 0.0, 0.0")
+    exact = exact.replace("1.0 + np.array([1e-4, -2e-4, 1e-4])", "np.ones(3)")
+    (tmp_path / "marks.py").write_text(exact, encoding="utf-8")
+    done = warm.trirail("align", "geometry", *given, "--out", out, "--yes")
+    assert done.returncode == 0, done.stderr
+    assert "The configured geometry is as good as can be measured" in " ".join(done.stdout.split())
+    assert "nothing is written" in done.stdout
     assert not out.exists()
     assert not camera.exists()
 

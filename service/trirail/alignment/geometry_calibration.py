@@ -33,7 +33,7 @@ from trirail.alignment.pose_plan import choose_poses, find_candidates
 from trirail.alignment.residual_map import ResidualMap, fit_residual_map
 from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.stage_fit import StageFit, camera_covariance, fit_stage
-from trirail.alignment.stage_model import StageLook, StageModel, list_marks
+from trirail.alignment.stage_model import StageLook, StageModel, list_marks, mark_displacements
 from trirail.errors import AlignmentError, AlignmentFault, RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry, Room, travels
 from trirail.kinematics.robot import inverse
@@ -62,6 +62,10 @@ MAX_SWAPPED_SHARE = 0.1
 ones."""
 SYSTEMATIC = 1.5
 """Ratio of residuals to picture noise above which the looks have systematic errors."""
+SIGNIFICANT, SIGNIFICANT_IF_SYSTEMATIC = 2.5, 4.0
+"""Ratio of a correction to its standard deviation, as displacements of the marks, above which the correction makes the
+stage better. The noise makes it worse by one standard deviation. Systematic errors also resemble corrections, and the
+standard deviation does not include this."""
 MIN_NAMED_SHARE = 0.3
 """Least weight of a parameter in an undetermined combination at which the parameter is named. The parameters are
 divided by StageModel.doubts."""
@@ -121,11 +125,24 @@ class GeometryCalibration(NamedTuple):
     map: ResidualMap | None
     """Map of the errors that remain after the fit; None if the errors are not systematic, or there are too few
     looks."""
+    change: float
+    """Displacement of the marks by the correction, root mean square over the travel [m]."""
+    change_deviation: float
+    """Standard deviation of `change` [m]."""
 
     @property
     def is_systematic(self) -> bool:
         """True if the residuals clearly exceed the picture noise, which shows errors that no geometry explains."""
         return self.noise > SYSTEMATIC * self.picture_noise
+
+    @property
+    def is_significant(self) -> bool:
+        """True if the correction is clearly greater than its uncertainty.
+
+        Otherwise, the configured geometry is as good as can be measured, and the correction could make it worse.
+        """
+        limit = SIGNIFICANT_IF_SYSTEMATIC if self.is_systematic else SIGNIFICANT
+        return self.change > limit * self.change_deviation
 
 
 class GeometryTask(NamedTuple):
@@ -390,7 +407,18 @@ def solve(
         outliers,
         known,
         fit_residual_map(geometry, task.room, state, model.view_of, used) if is_systematic else None,
+        *_change(model, fit, _travel(task)),
     )
+
+
+def _change(model: StageModel, fit: StageFit, poses: Floats) -> tuple[float, float]:
+    """Return the root mean square displacement of the marks by the correction, and its standard deviation [m]."""
+    moved, legs = mark_displacements(model, poses), model.legs
+    known = moved @ fit.determined
+    covariance = fit.determined.T @ fit.covariance[:legs, :legs] @ fit.determined
+    places = len(moved) / 2
+    variance = max(float(np.einsum("ij,jk,ik->", known, covariance, known)), 0.0)
+    return math.sqrt(float(((moved @ fit.unknowns[:legs]) ** 2).sum()) / places), math.sqrt(variance / places)
 
 
 def _check_noise(fit: StageFit, looks: Sequence[StageLook]) -> None:

@@ -228,19 +228,7 @@ def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Float
 
     `rows` are the derivatives of the poses with respect to corrections in units of `doubts`, (N, 3, 18).
     """
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    zero, one = np.zeros(len(poses)), np.ones(len(poses))
-    frames = np.stack(
-        [
-            np.stack([one, zero, zero], axis=1),
-            np.stack([zero, one, zero], axis=1),
-            np.stack([-poses[:, 1], poses[:, 0], one], axis=1),
-            np.stack([c, s, zero], axis=1),
-            np.stack([-s, c, zero], axis=1),
-            np.stack([zero, zero, one], axis=1),
-        ],
-        axis=2,
-    )
+    frames = _frame_changes(poses)
     moved, frames = rows.reshape(-1, rows.shape[2]), frames.reshape(-1, 6)
     unit = np.abs(moved).max()
     null = _null_space(np.concatenate([moved / unit, frames], axis=1))[:, : rows.shape[2]]
@@ -252,6 +240,42 @@ def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Float
     _, values, directions = np.linalg.svd(null, full_matrices=True)
     rank = int((values > 1e-6).sum())
     return directions[rank:].T, held
+
+
+def _frame_changes(poses: Floats) -> Floats:
+    """Return the changes of poses with the base frame and with the platform's frame, (N, 3, 6)."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    zero, one = np.zeros(len(poses)), np.ones(len(poses))
+    return np.stack(
+        [
+            np.stack([one, zero, zero], axis=1),
+            np.stack([zero, one, zero], axis=1),
+            np.stack([-poses[:, 1], poses[:, 0], one], axis=1),
+            np.stack([c, s, zero], axis=1),
+            np.stack([-s, c, zero], axis=1),
+            np.stack([zero, zero, one], axis=1),
+        ],
+        axis=2,
+    )
+
+
+def mark_displacements(model: StageModel, poses: Floats) -> Floats:
+    """Return the displacements of the marks on the table per unit of each leg unknown, (n, legs) [m].
+
+    The rows are x and y of each mark at each of the poses (N, 3) [m, rad]. The part of a displacement that other frames
+    or another unit of length would cause is omitted.
+    """
+    by_legs = _pose_changes(model.start, model.start, poses, inverse(model.start, poses).position)
+    length = np.column_stack([poses[:, :2], np.zeros(len(poses))])[..., None]
+    changes = np.concatenate([by_legs * model.doubts @ model.basis, _frame_changes(poses), length], axis=2)
+    rows = []
+    for place in model.places.values():
+        _, by_phi = carry(poses, np.array(place))
+        rows.append((changes[:, :2] + by_phi[:, :, None] * changes[:, 2:]).reshape(-1, changes.shape[2]))
+    moved, frames = np.split(np.concatenate(rows), [model.legs], axis=1)
+    frames, values, _ = np.linalg.svd(frames, full_matrices=False)
+    frames = frames[:, values > INVISIBLE * values[0]]
+    return np.asarray(moved - frames @ (frames.T @ moved))
 
 
 def _null_space(matrix: Floats) -> Floats:

@@ -51,7 +51,8 @@ def geometry(
     """Measure the stage's rails, pivots, scales and cameras by moves over its whole travel, and propose the results.
 
     The robot must be enabled, and the marks of a part must be in the pictures. Nothing is written unless you answer
-    yes, and CONFIG is never changed. The new configuration takes effect when you start the service with it.
+    yes, or if the corrections do not clearly exceed their uncertainty. CONFIG is never changed. The new configuration
+    takes effect when you start the service with it.
 
     Parameters
     ----------
@@ -102,9 +103,9 @@ def geometry(
     if not service.json:
         alignment_lines.show_geometry(result, settings.geometry.labels)
     asks = not yes and not service.json
-    usable = _usable_map(result, settings, quiet=service.json)
+    usable = _usable_map(result, settings, quiet=service.json) if result.is_significant else None
     written, failures = _Written(), list[TrirailError]()
-    if yes or (asks and _answers_yes("Write a new configuration with these values?")):
+    if result.is_significant and (yes or (asks and _answers_yes("Write a new configuration with these values?"))):
         if asks and usable is not None and not _answers_yes("Write the map too, as [correction] map?"):
             usable = None
         written, failures = _write(result, config, settings, out, calibration, targets, usable)
@@ -256,6 +257,9 @@ def _content(result: GeometryCalibration) -> dict[str, object]:
         "parameters": result.parameters,
         "deviations": {name: value if math.isfinite(value) else None for name, value in result.deviations.items()},
         "undetermined": result.undetermined,
+        "change": result.change,
+        "change_deviation": result.change_deviation,
+        "significant": result.is_significant,
         "residual": result.residual._asdict(),
         "noise": result.noise,
         "picture_noise": result.picture_noise,

@@ -86,6 +86,7 @@ def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
         terminal.print_line(
             f"{held.looks} looks held out of the fit: marks are off by {held.before_m * 1e6:.2f} µm ({held.before:.2f} "
             f"pixels) with the configured geometry, {held.after_m * 1e6:.2f} µm ({held.after:.2f} pixels) with this one"
+            ", each with its own fit of the cameras"
         )
         if held.after >= held.before:
             terminal.print_line(
@@ -93,6 +94,15 @@ def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
             )
     systematic = "; larger than the noise: no geometry explains the rest" if result.is_systematic else ""
     terminal.print_line(f"residual {result.noise:.3f} pixel, pictures at rest {result.picture_noise:.3f}{systematic}")
+    terminal.print_line(
+        f"these corrections move the marks by {result.change * 1e6:.2f} ± {result.change_deviation * 1e6:.2f} µm over "
+        "the travel"
+    )
+    if not result.is_significant:
+        terminal.print_line(
+            "The configured geometry is as good as can be measured: these corrections could make it worse. More looks, "
+            "marks or pictures would be more certain."
+        )
 
 
 def _labelled(name: str, labels: Sequence[str]) -> str:
