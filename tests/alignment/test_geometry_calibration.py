@@ -25,7 +25,7 @@ from trirail.alignment.geometry_calibration import (
 )
 from trirail.alignment.images import Lens, Pair, project_points
 from trirail.alignment.pose_plan import choose_poses, find_candidates
-from trirail.alignment.procedure import AlignmentTask, Observation, StageMotion, align, repeat_calibration
+from trirail.alignment.procedure import AlignmentTask, Observation, StageMotion, align, poses_within, repeat_calibration
 from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.stage_model import StageLook, StageModel
 from trirail.client.stage_as_built import built_otherwise
@@ -481,6 +481,35 @@ def test_cameras_are_checked_within_the_travel_from_wherever_the_stage_stands(na
     poses = np.array(visited)
     assert ((poses >= task.room.low) & (poses <= task.room.high)).all()
     assert task.room.holds(travels(task.start, poses)).all()
+
+
+@pytest.mark.parametrize("home", [3e-4, 1e-3, 2e-3])
+@pytest.mark.generated(*range(6))
+def test_a_check_after_an_error_of_homing_stays_within_the_limits(seed: int, home: float) -> None:
+    """The calibration corrects the poses at which it looked, some of which were outside the limits."""
+    made, task = stage(sorted(STAGES)[seed % 3], seed, noise=0.05, lens="perspective")
+    signs = np.random.default_rng(seed).choice((-1.0, 1.0), 3).tolist()
+    legs = [
+        dataclasses.replace(leg, home=leg.home + sign * home) for leg, sign in zip(made.built.legs, signs, strict=True)
+    ]
+    made.built = dataclasses.replace(made.built, legs=tuple(legs))
+    found = made.drive(calibrate_geometry(task._replace(looks=4)))
+    poses = poses_within(task.room, found.geometry, found.cameras)
+    assert len(poses) >= 12
+    made.configured, made.scales = found.geometry, (1.0 + made.scales) / (1.0 + np.array(found.scales)) - 1.0
+    made.pose, go = (0.0, 0.0, 0.0), made.go
+
+    def watched(motion: StageMotion) -> None:
+        go(motion)
+        assert (np.abs(made.pose) <= np.add(task.room.high, 1e-12)).all()
+        assert task.room.holds(travels(found.geometry, made.pose), 1e-12)
+
+    made.go = watched  # type: ignore[method-assign]
+    again = made.drive(repeat_calibration(found.cameras, 4, poses))
+    assert not any(view.is_changed for view in compare_views(found.cameras, again))
+    outside = task.room._replace(low=(0.02, 0.02, 0.0), high=(0.03, 0.03, 0.1))
+    with pytest.raises(AlignmentError, match="all poses of the calibration are outside"):
+        poses_within(outside, found.geometry, found.cameras)
 
 
 def test_marks_that_do_not_move_and_a_field_without_marks_are_refused() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Mapping, Sequence
 
+import numpy as np
 from msgspec import structs
 from trirail_drivers.interface import Triple
 
@@ -17,6 +18,7 @@ from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibr
 from trirail.alignment.fresh_pictures import observe_mean
 from trirail.alignment.images import Lens, Pair
 from trirail.errors import AlignmentError, AlignmentFault
+from trirail.kinematics.geometry import Geometry, Room, travels
 
 DEFAULT_MOVES: tuple[Triple, ...] = tuple(
     (x * 1e-3, y * 1e-3, math.radians(turn))
@@ -106,17 +108,18 @@ def _check_first(first: Observation, poses: Sequence[Triple], views: Mapping[str
 
 
 def repeat_calibration(
-    saved: CameraCalibration, looks: int = 1
+    saved: CameraCalibration, looks: int = 1, poses: Sequence[Triple] | None = None
 ) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
     """Repeat a saved calibration: calibrate the same views at the same poses, and move back to the current pose.
 
-    The poses may span nearly the whole travel. Only the saved ones are known to be within the limits, so they are not
-    shifted to the current pose. Each motion arrives from the same side as in the saved calibration.
+    The poses may span nearly the whole travel, so they are not shifted to the current pose. If some of them are outside
+    the limits, `poses` are the others. Each motion arrives from the same side as in the saved calibration.
     """
+    poses = saved.poses if poses is None else poses
     start = (yield StageMotion(ZERO_OFFSET, PLATFORM_CENTRE)).pose
-    x, y, phi = saved.poses[0]
+    x, y, phi = poses[0]
     yield StageMotion((x, y, phi))
-    moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in saved.poses[1:]]
+    moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in poses[1:]]
     views = {name: mark.view for name, mark in saved.marks.items()}
     lens = next(iter(saved.views.values())).lens
     # Each view has its own centre if the geometry of the stage was calibrated with it.
@@ -124,6 +127,23 @@ def repeat_calibration(
     calibration = yield from calibrate_by_moves(moves, views, lens, centres, looks, saved.approach)
     yield StageMotion(start)
     return calibration
+
+
+def poses_within(room: Room, geometry: Geometry, saved: CameraCalibration) -> list[Triple]:
+    """Return the poses of a saved calibration that are within the limits, also on the way of its approach.
+
+    A calibration of the geometry corrects the poses at which it looked. After a homing error of 1 mm, some of them are
+    outside the limits of the platform. Raises AlignmentError if no pose is within the limits.
+    """
+    beyond = np.add(saved.poses, saved.approach or ZERO_OFFSET)
+    within = np.ones(len(saved.poses), bool)
+    for poses in (np.array(saved.poses), beyond):
+        within &= ((poses >= room.low) & (poses <= room.high)).all(axis=1) & room.holds(travels(geometry, poses))
+    if not within.any():
+        raise AlignmentError(
+            AlignmentFault.MOVES, "all poses of the calibration are outside the limits of the stage; calibrate again"
+        )
+    return [pose for pose, is_within in zip(saved.poses, within.tolist(), strict=True) if is_within]
 
 
 def plain_approach(approach: Triple | None) -> Triple | None:

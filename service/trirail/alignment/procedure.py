@@ -22,6 +22,7 @@ from trirail.alignment.calibration_procedure import (
     ZERO_OFFSET,
     calibrate_by_moves,
     calibration_moves,
+    poses_within,
     repeat_calibration,
 )
 from trirail.alignment.camera_calibration import CameraCalibration
@@ -54,6 +55,7 @@ __all__ = [
     "calibration_moves",
     "measure_part",
     "observe_mean",
+    "poses_within",
     "repeat_calibration",
 ]
 

@@ -182,17 +182,21 @@ def check(
         time.
     """
     from trirail.alignment.calibration_diff import compare_views, find_missing_views
-    from trirail.alignment.procedure import AlignmentTask, measure_part, repeat_calibration
+    from trirail.alignment.procedure import AlignmentTask, measure_part, poses_within, repeat_calibration
     from trirail.client.alignment import drive
     from trirail.client.stage_geometry import geometry_id
+    from trirail.config import room
+    from trirail.telemetry.drawn_robot import DrawnRobot
 
     kept = _load_calibration(file, service)
     task = AlignmentTask(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=source.looks)
     with source.open_source() as (look, _), service.open() as robot:
         _checked_calibration(kept, file, geometry_id(robot.info()))
         if moves:
-            again = repeat_calibration(kept.calibration, source.looks)
-            progress = _with_progress(again, service, len(kept.calibration.poses))
+            stage = DrawnRobot.from_info(robot.info())
+            poses = poses_within(room(stage.limits), stage.geometry, kept.calibration)
+            again = repeat_calibration(kept.calibration, source.looks, poses)
+            progress = _with_progress(again, service, len(poses))
             now = drive(robot, look, progress, source.speed, source.wait)
             changes, missing = compare_views(kept.calibration, now), find_missing_views(kept.calibration, now)
         else:
