@@ -88,6 +88,15 @@ def test_places_are_the_inverse_of_pixels_and_slopes_their_derivative(seed: int,
         assert projection_jacobians(view, points)[:, :, axis] == pytest.approx(difference, rel=1e-5, abs=1.0)
 
 
+@given(SEEDS, st.floats(-9.0, -5.3))
+def test_turns_within_the_noise_are_refused(seed: int, exponent: float) -> None:
+    """The moves determine the centre of rotation, but the noise is as large as the displacement by the turn."""
+    stage = two_cameras(seed, noise=0.1)
+    with pytest.raises(AlignmentError, match="distance from the centre of rotation is uncertain by") as refused:
+        stage.drive(calibrate_by_moves(calibration_moves("affine", 1e-3, 10.0**exponent)))
+    assert refused.value.fault is AlignmentFault.MOVES
+
+
 UNEQUAL = {"left": 0.05, "right": 1.0}
 """Noise of the pictures of two cameras [pixel]."""
 
