@@ -185,7 +185,7 @@ def test_wrong_pictures_are_refused_with_the_residual_and_what_to_check(seed: in
         return now
 
     made.look = wrong  # type: ignore[method-assign]
-    with pytest.raises(AlignmentError, match=r"check that|check the names") as refused:
+    with pytest.raises(AlignmentError, match=r"check that|check the names|take a new picture") as refused:
         made.drive(calibrate_geometry(task._replace(field=field)))
     assert refused.value.fault is AlignmentFault.STILL
 

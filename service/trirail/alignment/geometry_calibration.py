@@ -384,9 +384,9 @@ def solve(
             "calibrate again, and use coded marks if this happens repeatedly",
         )
     state, geometry = model.state(fit.unknowns), model.geometry(fit.unknowns)
-    deviations = model.doubts * np.sqrt(
-        np.einsum("ij,jk,ik->i", model.basis, fit.covariance[: model.legs, : model.legs], model.basis)
-    )
+    covariance = fit.covariance[: model.legs, : model.legs]
+    variances = np.einsum("ij,jk,ik->i", model.basis, covariance, model.basis)
+    deviations = model.doubts * np.sqrt(np.maximum(variances, 0.0))  # rounding can make a zero negative
     names = [f"{leg} {name}" for leg, name in model.parameters]
     values = np.column_stack([state.corrections, state.scales]).ravel()
     unknown = _undetermined(model, fit)
