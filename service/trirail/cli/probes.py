@@ -102,7 +102,7 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
 
 def why_unwritable(folder: Path) -> str:
     """Return why this user cannot write files to a folder, which need not exist yet; "" if this user can."""
-    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.exists(path))
     if not existing.is_dir():
         return f"{existing} is not a folder"
     return "" if os.access(existing, os.W_OK | os.X_OK) else f"this user may not write in {existing}"

@@ -339,7 +339,7 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     keep_mb: Annotated[float, Meta(ge=1.0, le=1e9)] = 20_000.0
     """Maximum total size of the recordings in the folder [1e6 bytes]. The oldest recordings are deleted first, black
     boxes last. The files that are being written count for at most half, so that a large one does not take the place of
-    every other. The oldest are also deleted, except black boxes, while less than 134 MB of the disk are free."""
+    every other. The oldest are also deleted, except black boxes, while less than 84 MB of the disk are free."""
 
 
 class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):

@@ -12,6 +12,7 @@ import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
+from glob import escape
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -106,14 +107,24 @@ def _cached(function: Callable[..., Any], **options: Any) -> Any:
         dispatcher = compile_later()
     kept = dispatcher._cache._cache_file
     kept._version = (kept._version, FINGERPRINT)
-    kept._load_index, kept._load_data = _or_nothing(kept._load_index, {}), _or_nothing(kept._load_data, None)
-    kept.save = _or_nothing(kept.save, None)
+    kept._load_index, kept._load_data = _or_nothing(kept._load_index, dict), _or_nothing(kept._load_data, _none)
+    kept.save = _or_nothing(kept.save, _none)
+    if not kept._load_index():
+        # numba writes a new index before the new code. If it were interrupted in between, the index would name the code
+        # of an earlier version.
+        for outdated in Path(kept._cache_path).glob(f"{escape(kept._index_name.removesuffix('.nbi'))}.*.nbc"):
+            with contextlib.suppress(OSError):
+                outdated.unlink()
     _functions.append(dispatcher)
     return dispatcher
 
 
-def _or_nothing(use: Callable[P, R], nothing: R) -> Callable[P, R]:
-    """Return a function that uses a file of the cache, or returns `nothing` if that fails.
+def _none() -> None:
+    return None
+
+
+def _or_nothing(use: Callable[P, R], nothing: Callable[[], R]) -> Callable[P, R]:
+    """Return a function that uses a file of the cache, or returns `nothing()` if that fails.
 
     A power failure can leave files empty or incomplete, and a disk can be full. The function is then compiled again.
     """
@@ -122,7 +133,7 @@ def _or_nothing(use: Callable[P, R], nothing: R) -> Callable[P, R]:
         try:
             return use(*args, **kwargs)
         except Exception:  # noqa: BLE001 - pickle raises any error for damaged data
-            return nothing
+            return nothing()
 
     return use_if_possible
 

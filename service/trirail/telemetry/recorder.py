@@ -43,7 +43,7 @@ A low rate saves space. Nothing is lost, because the drawings can be made again 
 """
 CHECKS_HZ = 1
 """Number of times per second that the files, the folder, the log and the live view are checked."""
-FREE = 2 * RESERVE
+FREE = RESERVE + (16 << 20)
 """Free space of the disk below which old recordings are deleted [bytes]. Below RESERVE, nothing would be recorded."""
 TIDY_EVERY = 10.0
 """Interval at which the folder is checked, and at which the sidecar of the newest file is written [s]."""
@@ -153,7 +153,7 @@ class Recorder:
         self._last: int | None = None
         self._missed_cycles, self._reported, self._next_check = 0, (0, 0, 0), 0
         self._next_report = self._next_tidy = self._next_entry = 0.0
-        self._tidy_error = ""
+        self._tidy_error, self._space = "", retention.Space(FREE)
         self._reported_trouble = ""
         """Data reported as unrecorded, as returned by `unrecorded`; empty if no loss is being reported."""
         self._recovered_at = 0.0
@@ -401,13 +401,14 @@ class Recorder:
                 f"old recordings deleted, because all recordings exceed telemetry.keep_mb = {at_most / MB:g}: {names}"
             )
             self._warn(coded(words, EventCode.RECORDINGS_DELETED, keep_mb=at_most / MB, files=names))
-        if (shortage := FREE - free_space(folder)) > 0:
+        if (shortage := self._space.shortage(free_space(folder))) > 0.0:
             deleted, failed = retention.tidy(folder, math.inf, self._first.stem, shortage)
             errors += failed
             if deleted:
+                self._space.note_deletion()
                 names = ", ".join(path.name for path in deleted)
                 words = f"old recordings deleted, because less than {FREE / MB:.0f} MB of the disk were free: {names}"
-                self._warn(coded(words, EventCode.RECORDINGS_DELETED_FOR_SPACE, free_mb=FREE / MB, files=names))
+                self._warn(coded(words, EventCode.RECORDINGS_DELETED_FOR_SPACE, free_mb=round(FREE / MB), files=names))
         others = f", and {len(errors) - 1} more" if len(errors) > 1 else ""
         why = f"{errors[0]}{others}" if errors else ""
         if why and why != self._tidy_error:
@@ -445,7 +446,8 @@ def _overwrite(path: Path) -> Path:
         if retention.is_being_written(path):
             raise ServiceError(f"{path} is being written, perhaps by another service; name another file")
         with path.open("rb") as file:
-            if file.read(len(MAGIC)) not in (b"", MAGIC):
+            # A power failure can leave a recording empty or full of zeros.
+            if not MAGIC.startswith(file.read(len(MAGIC)).rstrip(b"\0")):
                 raise ServiceError(f"{path} already exists and is not a recording; name another file")
     path.open("wb").close()
     return path

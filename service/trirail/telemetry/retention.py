@@ -141,6 +141,28 @@ def is_being_written(path: Path) -> bool:
     return False
 
 
+class Space:
+    """Free space of a disk that recordings should leave, as long as deleting recordings frees space.
+
+    On some file systems, a deleted file frees no space, or not soon, and another program may fill the disk.
+    """
+
+    def __init__(self, wanted: float) -> None:
+        self._wanted = wanted
+        self._expected = self._free = 0.0
+        self._grows = True
+
+    def shortage(self, free: float) -> float:
+        """Return how much space to free, given the free space [bytes]; 0 if the last deletion has freed too little."""
+        self._grows = free >= self._wanted or (self._grows and free >= self._expected)
+        self._free, self._expected = free, 0.0
+        return max(0.0, self._wanted - free) if self._grows else 0.0
+
+    def note_deletion(self) -> None:
+        """Record that recordings were deleted because of the shortage returned last, of which half must become free."""
+        self._expected = (self._free + self._wanted) / 2.0
+
+
 class Tidied(NamedTuple):
     """Result of a deletion of old recordings."""
 
