@@ -611,12 +611,50 @@ def test_a_stop_ends_what_the_stage_does_in_whichever_event_loop(
     assert robot.state().commanded.pose.x < 0.04
 
 
-def test_a_path_that_a_pause_has_stopped_is_not_complete(stage: Stage, robot: Robot, engine: Any) -> None:
+@pytest.mark.parametrize("what", ["axis", "flight"])
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_stop_reaches_what_an_event_loop_has_begun_that_is_closed_or_blocked(
+    stage: Stage, robot: Robot, what: str, closed: bool
+) -> None:
+    """As that of a notebook while another cell computes, or of a script that an error has ended."""
+    other, stopped = Stage(robot, "other"), threading.Event()
+    flight = other.fly_to(0.05, 0.0, 0.0)
+
+    async def begin() -> None:
+        begun = flight.kickoff() if what == "flight" else other.x.set(0.05)
+        while robot.state().pose.x < 0.002:
+            await asyncio.sleep(0.01)
+        if not closed:
+            threading.Thread(target=stop).start()
+            stopped.wait(WITHIN)  # which blocks this event loop
+            await asyncio.wait([begun.task])
+
+    def stop() -> None:
+        try:
+            asyncio.run(other.stop())
+        finally:
+            stopped.set()
+
+    robot.override(10.0)
+    before = newest_event(robot)
+    asyncio.run(begin())
+    if closed:
+        stop()
+    assert outcome_of(robot, before) == "stopped"
+    assert robot.state().commanded.pose.x < 0.04
+
+
+@pytest.mark.parametrize("with_axis", [True, False])
+def test_a_path_that_a_pause_has_stopped_is_not_complete(
+    stage: Stage, robot: Robot, engine: Any, with_axis: bool
+) -> None:
     """Unless the plan repeats its kickoff; here it resumes behind that."""
     flight = stage.fly_to(0.05, 0.0, 0.0)
 
     def plan() -> Any:
         yield from bps.open_run()
+        if with_axis:  # a pause stops what was set before it pauses the flight
+            yield from bps.mv(stage.y, 0.001)
         yield from bps.kickoff(flight, wait=True)
         yield from bps.checkpoint()
         yield from bps.sleep(0.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any, cast
@@ -170,17 +171,29 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
     async def stop_path(self, success: bool) -> None:
         """Stop the path in the event loop in which it was started; return when the robot is at rest."""
         await self._sending.end()
-        goal = self._goal
-        if goal is not None and goal.result is None:
-            self._interrupted = goal if success else None
+        if (goal := self._interrupt(success)) is not None:
             await cancel(goal)
+
+    def interrupt(self, success: bool) -> AsyncGoalHandle | None:
+        """Stop the path from another thread, whose event loop then stops the goal that is returned, if there is one."""
+        with contextlib.suppress(RuntimeError):  # the event loop is closed, so nothing is being sent
+            self._loop.call_soon_threadsafe(self._sending.abandon)
+        return self._interrupt(success)
+
+    def _interrupt(self, success: bool) -> AsyncGoalHandle | None:
+        goal = self._goal
+        if goal is None or goal.result is not None:
+            return None
+        self._interrupted = goal if success else None
+        return goal
 
     async def pause(self) -> None:
         """Stop the path. If the plan resumes from a checkpoint before `kickoff`, it repeats the path from its start.
 
         Otherwise `complete` raises an error, unless it is already in progress.
         """
-        self._paused = self._paused or self.under_way
+        # The plan may already have stopped the path, together with the axes.
+        self._paused = self._paused or self.under_way or self._stopped is not None
         await self.stop()
 
     async def resume(self) -> None:

@@ -9,10 +9,13 @@ from contextlib import aclosing
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
+
 from trirail.client.async_client import AsyncRobot
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.state import Pose, State
+from trirail.wire.vocabulary import Command, Stop
 
 GATHERING_S = 0.005
 """Time after a set during which other sets join its goal [s]. Sets of a message group arrive within a millisecond."""
@@ -118,13 +121,17 @@ class Sending:
             async with asyncio.timeout(ANSWERED_S):
                 await self._lock.acquire()
         except TimeoutError:
-            self._abandoned = True
-            if self._call is not None:
-                self._call.cancel()
+            self.abandon()
             raise ServiceError(
                 "the service has not answered a goal, which was stopped in case it has arrived"
             ) from None
         self._lock.release()
+
+    def abandon(self) -> None:
+        """Do not wait for the answer to a goal that is being sent; the client stops the goal."""
+        self._abandoned = True
+        if self._call is not None:
+            self._call.cancel()
 
 
 class Mover:
@@ -137,6 +144,7 @@ class Mover:
 
     def __init__(self, robot: AsyncRobot) -> None:
         self._robot = robot
+        self._loop = asyncio.get_running_loop()
         self._gathered: list[AxisMove] = []
         """Sets that later sets may still join. A new list begins with the next goal."""
         self._unsent: list[AxisMove] = []
@@ -181,8 +189,7 @@ class Mover:
         With `success`, the sets end without an error, as if the axes had reached their targets. A plan that pauses
         repeats these sets when it resumes.
         """
-        unsent, self._unsent, self._gathered = self._unsent, [], []
-        end_all(unsent, None if success else TrirailError("the motion was stopped before its goal was sent"))
+        self._end_unsent(success)
         try:
             await self._sending.end()
         finally:
@@ -196,6 +203,34 @@ class Mover:
         await cancel(motion.goal)
         if motion.lost and self._motion is motion:
             self._motion = None
+
+    def interrupt(self, success: bool) -> AsyncGoalHandle | None:
+        """Stop moving from another thread, whose event loop then stops the goal that is returned, if there is one.
+
+        A goal that is being sent is stopped in case the service has received it.
+        """
+        motion = self._motion
+        try:
+            self._loop.call_soon_threadsafe(self._abandon_unsent, success)
+        except RuntimeError:  # the event loop is closed, so nothing is being sent
+            self._motion = None
+        if motion is None or motion.goal.result is not None:
+            return None
+        motion.interrupted |= success
+        return motion.goal
+
+    @property
+    def moves(self) -> bool:
+        """Whether a goal is in progress, as far as is known."""
+        return self._motion is not None and self._motion.goal.result is None
+
+    def _abandon_unsent(self, success: bool) -> None:
+        self._end_unsent(success)
+        self._sending.abandon()
+
+    def _end_unsent(self, success: bool) -> None:
+        unsent, self._unsent, self._gathered = self._unsent, [], []
+        end_all(unsent, None if success else TrirailError("the motion was stopped before its goal was sent"))
 
     async def settle(self, goal: AsyncGoalHandle) -> Result:
         """Wait for the end of a goal. Raises ServiceError if the service is lost or restarts before the goal ends."""
@@ -285,6 +320,15 @@ def end_all(moves: list[AxisMove], error: Exception | None) -> None:
     """End sets with an error; without an error if `error` is None."""
     for move in moves:
         move.finish(error)
+
+
+async def stop_elsewhere(robot: AsyncRobot, goal: AsyncGoalHandle) -> None:
+    """Stop a goal that was sent in another event loop, which may be blocked or closed; return when it is stopped."""
+    try:
+        await robot.command(Command.STOP, msgspec.json.encode(Stop(goal.id)))
+    except RefusedError as error:
+        if error.code != RefusalCode.NO_GOAL:
+            raise
 
 
 async def cancel(goal: AsyncGoalHandle) -> None:

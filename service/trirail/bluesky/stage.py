@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncGenerator, AsyncIterator, Coroutine, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from contextlib import aclosing
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
@@ -17,7 +17,7 @@ from ophyd_async.core import AsyncLocatable, AsyncReadable, WatchableAsyncStatus
 
 from trirail.bluesky.flight import Flight, refuse_mock
 from trirail.bluesky.monitor import Monitored, Readings
-from trirail.bluesky.mover import Mover, setpoint_of
+from trirail.bluesky.mover import Mover, setpoint_of, stop_elsewhere
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.client.trajectory import Points, points_of
@@ -117,12 +117,19 @@ class Stage(Monitored, AsyncReadable, HasHints):
 
         Return when the robot is at rest. Goals of other clients continue.
         """
+        here, robot = asyncio.get_running_loop(), (await self.link()).robot
         flights = [flight for flight in self._flights if flight.under_way]
         for flight in flights:
             flight.note_stop(success)
         movers = [(loop, link.mover) for loop, task in tuple(self._links.items()) if (link := _made(task))]
-        await asyncio.gather(*(run_in(loop, mover.stop(success)) for loop, mover in movers))
-        await asyncio.gather(*(run_in(flight.loop, flight.stop_path(success)) for flight in flights))
+        # Another event loop may be blocked or closed. Its goals are stopped in this one.
+        elsewhere = [mover.interrupt(success) for loop, mover in movers if loop is not here]
+        elsewhere += [flight.interrupt(success) for flight in flights if flight.loop is not here]
+        await asyncio.gather(
+            *(stop_elsewhere(robot, goal) for goal in elsewhere if goal is not None),
+            *(mover.stop(success) for loop, mover in movers if loop is here),
+        )
+        await asyncio.gather(*(flight.stop_path(success) for flight in flights if flight.loop is here))
 
     def note_flight(self, flight: Flight) -> None:
         """Record that a flight has been started, so that `stop` stops it; forget those that have ended."""
@@ -194,9 +201,16 @@ class Stage(Monitored, AsyncReadable, HasHints):
         }
 
     async def _connect(self, loop: asyncio.AbstractEventLoop) -> StageLink:
-        """Return a connection for the running event loop. Connections of closed event loops are closed first."""
+        """Return a connection for the running event loop.
+
+        Connections of closed event loops are closed first, but for those with goals that `stop` must stop.
+        """
         for closed in [each for each in tuple(self._links) if each.is_closed()]:
-            if before := _made(self._links.pop(closed)):
+            before = _made(self._links[closed])
+            if before is not None and before.mover.moves:
+                continue
+            del self._links[closed]
+            if before is not None:
                 with contextlib.suppress(RuntimeError):  # tasks that the closed event loop has left behind
                     await before.robot.close()
         robot = await self._robot._for_running_loop()
@@ -207,16 +221,6 @@ class Stage(Monitored, AsyncReadable, HasHints):
 def _made(task: asyncio.Task[StageLink]) -> StageLink | None:
     """Return the connection that a task has made; None if there is none."""
     return task.result() if task.done() and not task.cancelled() and task.exception() is None else None
-
-
-async def run_in(loop: asyncio.AbstractEventLoop, work: Coroutine[Any, Any, None]) -> None:
-    """Run `work` in an event loop, which may be that of another thread. An event loop that rests is left out."""
-    if loop is asyncio.get_running_loop():
-        await work
-    elif loop.is_running():
-        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, loop))
-    else:
-        work.close()
 
 
 class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
