@@ -102,6 +102,7 @@ class GeometryCalibration(NamedTuple):
     """Result of a calibration: corrections to the configured geometry, and the cameras."""
 
     geometry: Geometry
+    """Calibrated geometry; the configured one if the corrections are not significant."""
     scales: Triple
     """Real position of each slider per metre of its reading, minus 1. Divide counts_per_metre by 1 plus this value, and
     multiply offset by it."""
@@ -394,7 +395,7 @@ def solve(
     a, b, c = state.scales.tolist()
     is_systematic = fit.noise > SYSTEMATIC * picture_noise
     used = _used(known, fit)
-    return GeometryCalibration(
+    calibration = GeometryCalibration(
         geometry,
         (a, b, c),
         dict(zip(names, values.tolist(), strict=True)),
@@ -408,6 +409,23 @@ def solve(
         known,
         fit_residual_map(geometry, task.room, state, model.view_of, used) if is_systematic else None,
         *_change(model, fit, _travel(task)),
+    )
+    return calibration if calibration.is_significant else _with_configured_legs(calibration, task, model, used)
+
+
+def _with_configured_legs(
+    calibration: GeometryCalibration, task: GeometryTask, model: StageModel, looks: Sequence[StageLook]
+) -> GeometryCalibration:
+    """Return a calibration of the cameras, and a map, for the configured geometry; the parameters are those found."""
+    fit = fit_stage(model, looks, fixed_legs=True)
+    state, geometry = model.state(fit.unknowns), model.geometry(fit.unknowns)
+    cameras = calibrated_cameras(model, fit, looks, task.looks)
+    a, b, c = state.scales.tolist()
+    return calibration._replace(
+        geometry=geometry,
+        scales=(a, b, c),
+        cameras=structs.replace(cameras, approach=plain_approach(task.approach)),
+        map=fit_residual_map(geometry, task.room, state, model.view_of, looks) if calibration.is_systematic else None,
     )
 
 

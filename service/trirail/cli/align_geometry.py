@@ -51,8 +51,8 @@ def geometry(
     """Measure the stage's rails, pivots, scales and cameras by moves over its whole travel, and propose the results.
 
     The robot must be enabled, and the marks of a part must be in the pictures. Nothing is written unless you answer
-    yes, or if the corrections do not clearly exceed their uncertainty. CONFIG is never changed. The new configuration
-    takes effect when you start the service with it.
+    yes. Corrections that do not clearly exceed their uncertainty are not written. CONFIG is never changed. The new
+    configuration takes effect when you start the service with it.
 
     Parameters
     ----------
@@ -103,9 +103,13 @@ def geometry(
     if not service.json:
         alignment_lines.show_geometry(result, settings.geometry.labels)
     asks = not yes and not service.json
-    usable = _usable_map(result, settings, quiet=service.json) if result.is_significant else None
+    usable = _usable_map(result, settings, quiet=service.json)
     written, failures = _Written(), list[TrirailError]()
-    if result.is_significant and (yes or (asks and _answers_yes("Write a new configuration with these values?"))):
+    if result.is_significant:
+        question = "Write a new configuration with these values?"
+    else:
+        question = "Write the calibration of the cameras for the configured geometry?"
+    if yes or (asks and _answers_yes(question)):
         if asks and usable is not None and not _answers_yes("Write the map too, as [correction] map?"):
             usable = None
         written, failures = _write(result, config, settings, out, calibration, targets, usable)
@@ -186,8 +190,8 @@ def _write(
 ) -> tuple[_Written, list[TrirailError]]:
     """Write the configuration, the calibration of the cameras, and the map.
 
-    Return the files that were written, and the errors. A measurement takes long, so an error does not prevent the other
-    files.
+    The configuration is written if it would differ. Return the files that were written, and the errors. A measurement
+    takes long, so an error does not prevent the other files.
     """
     from trirail.client import calibration_file
     from trirail.commissioning import config_edit
@@ -201,6 +205,8 @@ def _write(
         written = written._replace(cameras=cameras, old_cameras=old)
     except TrirailError as error:
         failures.append(error)
+    if not result.is_significant and errors is None:
+        return written, failures
     new = out or config_edit.find_free_path(path, "calibrated")
     map_path = config_edit.find_free_path(new, "map") if errors is not None else None
     try:
@@ -241,8 +247,9 @@ def _report(written: _Written, path: Path, remarks: list[str]) -> None:
             terminal.print_line(f"{name} written to {file}")
     if written.old_cameras is not None:
         terminal.print_line(f"previous file saved as {written.old_cameras}")
-    if written.config is not None:
-        terminal.print_line(f"{path} is unchanged. To use the new configuration: trirail run {written.config}")
+    if written.config is None:
+        return
+    terminal.print_line(f"{path} is unchanged. To use the new configuration: trirail run {written.config}")
     terminal.print_line("Made with the previous geometry:")
     for remark in remarks:
         terminal.print_line(f"  {remark}")
