@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import re
 import signal
@@ -711,6 +712,29 @@ def test_a_flight_keeps_every_state_while_the_event_loop_is_blocked(stage: Stage
     under_way = {state.t for state in states if state.goal is not None}
     assert len(under_way) > 10
     assert len(under_way - set(kept)) <= 1  # one may come after the result
+
+
+def test_pauses_after_the_end_of_a_path_leave_it_complete(stage: Stage, robot: Robot, engine: Any) -> None:
+    flight = stage.fly_to(0.01, 0.0, 0.0)
+
+    def plan() -> Any:
+        yield from bps.open_run()
+        yield from bps.kickoff(flight, wait=True)
+        yield from bps.checkpoint()
+        while flight.under_way:
+            yield from bps.sleep(0.05)
+        yield from bps.pause()
+        yield from bps.pause()
+        yield from bps.complete(flight, wait=True)
+        yield from bps.close_run()
+
+    with pytest.raises(RunEngineInterrupted):
+        run(engine, plan())
+    for _ in range(2):
+        with contextlib.suppress(RunEngineInterrupted):
+            engine.resume()
+    assert engine.state == "idle"
+    assert robot.state().pose.x == pytest.approx(0.01, abs=HALF_WINDOW)
 
 
 def test_a_mock_is_refused_since_it_would_move_the_robot(stage: Stage, robot: Robot, engine: Any) -> None:

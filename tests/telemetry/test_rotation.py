@@ -415,6 +415,16 @@ def test_the_recorder_makes_room_on_a_disk_that_is_nearly_full(
     assert told[0] == f"old recordings deleted, because less than 84 MB of the disk were free: {old[0].name}"
 
 
+def test_space_that_is_used_again_counts_as_freed() -> None:
+    """The recorder itself writes more between two deletions than small recordings free."""
+    space = retention.Space(100.0)
+    for free in (90.0, 89.0, 88.0):
+        assert space.shortage(free) == 100.0 - free
+        space.note_deletion(free + 1.0)
+    space.note_deletion(88.0)
+    assert [space.shortage(free) for free in (88.0, 87.0, 100.0, 99.0)] == [0.0, 0.0, 0.0, 1.0]
+
+
 def test_a_recording_that_cannot_be_deleted_leaves_the_others_to_be_deleted(tmp_path: Path) -> None:
     """It is reported once, and once more if it could not be deleted again after it could."""
     stuck = tmp_path / "demo-20250101-110000.rrd"  # a folder cannot be unlinked, by root either

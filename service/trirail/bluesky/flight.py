@@ -100,6 +100,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         """
         self._end_sampling()  # that of a path for which the plan has not called `complete`
         self._goal, self._samples, self._collected, self._stopped, self._paused = None, [], 0, None, False
+        self._interrupted = None
         self._loop, self._sending = asyncio.get_running_loop(), Sending()
         self._begun = status = AsyncStatus(self._kickoff())
         self._stage.note_flight(self)
@@ -193,7 +194,8 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         Otherwise `complete` raises an error, unless it is already in progress.
         """
         # The plan may already have stopped the path, together with the axes.
-        self._paused = self._paused or self.under_way or self._stopped is not None
+        stopped = self._stopped is not None and self._goal is self._interrupted
+        self._paused = self._paused or self.under_way or stopped
         await self.stop()
 
     async def resume(self) -> None:

@@ -209,15 +209,18 @@ class Mover:
 
         A goal that is being sent is stopped in case the service has received it.
         """
-        motion = self._motion
-        try:
+        with contextlib.suppress(RuntimeError):  # the event loop is closed, so nothing is being sent
             self._loop.call_soon_threadsafe(self._abandon_unsent, success)
-        except RuntimeError:  # the event loop is closed, so nothing is being sent
-            self._motion = None
+        motion = self._motion
         if motion is None or motion.goal.result is not None:
             return None
         motion.interrupted |= success
         return motion.goal
+
+    def forget(self) -> None:
+        """Forget the goal, which was stopped elsewhere, if the event loop is closed: it would never get a result."""
+        if self._loop.is_closed():
+            self._motion = None
 
     @property
     def moves(self) -> bool:

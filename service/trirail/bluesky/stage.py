@@ -129,6 +129,8 @@ class Stage(Monitored, AsyncReadable, HasHints):
             *(stop_elsewhere(robot, goal) for goal in elsewhere if goal is not None),
             *(mover.stop(success) for loop, mover in movers if loop is here),
         )
+        for _, mover in movers:
+            mover.forget()
         await asyncio.gather(*(flight.stop_path(success) for flight in flights if flight.loop is here))
 
     def note_flight(self, flight: Flight) -> None:

@@ -405,7 +405,7 @@ class Recorder:
             deleted, failed = retention.tidy(folder, math.inf, self._first.stem, shortage)
             errors += failed
             if deleted:
-                self._space.note_deletion()
+                self._space.note_deletion(free_space(folder))
                 names = ", ".join(path.name for path in deleted)
                 words = f"old recordings deleted, because less than {FREE / MB:.0f} MB of the disk were free: {names}"
                 self._warn(coded(words, EventCode.RECORDINGS_DELETED_FOR_SPACE, free_mb=round(FREE / MB), files=names))

@@ -149,18 +149,17 @@ class Space:
 
     def __init__(self, wanted: float) -> None:
         self._wanted = wanted
-        self._expected = self._free = 0.0
+        self._before = 0.0
         self._grows = True
 
     def shortage(self, free: float) -> float:
-        """Return how much space to free, given the free space [bytes]; 0 if the last deletion has freed too little."""
-        self._grows = free >= self._wanted or (self._grows and free >= self._expected)
-        self._free, self._expected = free, 0.0
+        """Return how much space to free, given the free space [bytes]; 0 while deleting recordings frees nothing."""
+        self._before, self._grows = free, self._grows or free >= self._wanted
         return max(0.0, self._wanted - free) if self._grows else 0.0
 
-    def note_deletion(self) -> None:
-        """Record that recordings were deleted because of the shortage returned last, of which half must become free."""
-        self._expected = (self._free + self._wanted) / 2.0
+    def note_deletion(self, free: float) -> None:
+        """Compare the free space right after a deletion with that before it [bytes]."""
+        self._grows = free > self._before
 
 
 class Tidied(NamedTuple):
