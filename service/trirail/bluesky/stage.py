@@ -125,13 +125,16 @@ class Stage(Monitored, AsyncReadable, HasHints):
         # Another event loop may be blocked or closed. Its goals are stopped in this one.
         elsewhere = [mover.interrupt(success) for loop, mover in movers if loop is not here]
         elsewhere += [flight.interrupt(success) for flight in flights if flight.loop is not here]
-        await asyncio.gather(
+        stops = await asyncio.gather(
             *(stop_elsewhere(robot, goal) for goal in elsewhere if goal is not None),
             *(mover.stop(success) for loop, mover in movers if loop is here),
+            *(flight.stop_path(success) for flight in flights if flight.loop is here),
+            return_exceptions=True,  # each is tried
         )
+        if errors := [each for each in stops if each is not None]:
+            raise errors[0]
         for _, mover in movers:
             mover.forget()
-        await asyncio.gather(*(flight.stop_path(success) for flight in flights if flight.loop is here))
 
     def note_flight(self, flight: Flight) -> None:
         """Record that a flight has been started, so that `stop` stops it; forget those that have ended."""

@@ -109,11 +109,13 @@ def geometry(
         question = "Write a new configuration with these values?"
     else:
         question = "Write the calibration of the cameras for the configured geometry?"
-    if yes or (asks and _answers_yes(question)):
+    # The cameras were fitted without the configured map, with which the service would continue.
+    needless = not result.is_significant and usable is None and settings.correction.map is not None
+    if not needless and (yes or (asks and _answers_yes(question))):
         if asks and usable is not None and not _answers_yes("Write the map too, as [correction] map?"):
             usable = None
         written, failures = _write(result, config, settings, out, calibration, targets, usable)
-    remarks = _remarks(settings, taught)
+    remarks = _remarks(settings, taught) if written.config is not None else []
     if service.json:
         files = {name: None if path is None else str(path) for name, path in written._asdict().items()}
         errors = [str(each) for each in failures]

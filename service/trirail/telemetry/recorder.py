@@ -357,6 +357,8 @@ class Recorder:
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
             self._tidy(self._own_folder, self._config.telemetry.keep_mb * MB)
+        if self._own_folder is not None:
+            self._make_room(self._own_folder)
         if t >= self._next_entry and self._contents is not None and self._contents.began is not None:
             self._next_entry = t + TIDY_EVERY
             if not self._files.trouble:
@@ -393,7 +395,7 @@ class Recorder:
             volumes.turn()
 
     def _tidy(self, folder: Path, at_most: float) -> None:
-        """Delete the oldest recordings if all need more than `at_most` bytes, or if little of their disk is free."""
+        """Delete the oldest recordings if all need more than `at_most` bytes."""
         deleted, errors = retention.tidy(folder, at_most, self._first.stem)
         if deleted:
             names = ", ".join(path.name for path in deleted)
@@ -401,19 +403,20 @@ class Recorder:
                 f"old recordings deleted, because all recordings exceed telemetry.keep_mb = {at_most / MB:g}: {names}"
             )
             self._warn(coded(words, EventCode.RECORDINGS_DELETED, keep_mb=at_most / MB, files=names))
-        if (shortage := self._space.shortage(free_space(folder))) > 0.0:
-            deleted, failed = retention.tidy(folder, math.inf, self._first.stem, shortage)
-            errors += failed
-            if deleted:
-                self._space.note_deletion(free_space(folder))
-                names = ", ".join(path.name for path in deleted)
-                words = f"old recordings deleted, because less than {FREE / MB:.0f} MB of the disk were free: {names}"
-                self._warn(coded(words, EventCode.RECORDINGS_DELETED_FOR_SPACE, free_mb=round(FREE / MB), files=names))
         others = f", and {len(errors) - 1} more" if len(errors) > 1 else ""
         why = f"{errors[0]}{others}" if errors else ""
         if why and why != self._tidy_error:
             self._warn(coded(f"cannot delete old recordings: {why}", EventCode.RECORDINGS_KEPT, error=why))
         self._tidy_error = why
+
+    def _make_room(self, folder: Path) -> None:
+        """Delete the oldest recordings if little of their disk is free."""
+        shortage = self._space.shortage(free_space(folder))
+        if shortage > 0.0 and (deleted := retention.tidy(folder, math.inf, self._first.stem, shortage).deleted):
+            self._space.note_deletion(free_space(folder))
+            names = ", ".join(path.name for path in deleted)
+            words = f"old recordings deleted, because less than {FREE / MB:.0f} MB of the disk were free: {names}"
+            self._warn(coded(words, EventCode.RECORDINGS_DELETED_FOR_SPACE, free_mb=round(FREE / MB), files=names))
 
     def _missing_text(self) -> str:
         """Return a message about missing data if any count has changed since the last message; otherwise return ""."""
