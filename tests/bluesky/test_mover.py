@@ -140,6 +140,17 @@ def test_sets_that_wait_are_stopped_before_their_goal_is_sent(success: bool, end
     run(work)
 
 
+def test_a_second_set_of_an_axis_begins_a_goal_of_its_own() -> None:
+    async def work(robot: Robot, mover: Mover) -> None:
+        first, second, third = mover.start({0: 0.01}), mover.start({0: 0.02}), mover.start({1: 0.03})
+        await until(lambda: len(robot.goals) == 2)
+        robot.end("done")
+        assert [await outcome(move) for move in (first, second, third)] == ["preempted", "", ""]
+        assert robot.targets == [(0.01, 0.0, 0.0), (0.02, 0.03, 0.0)]
+
+    run(work)
+
+
 def test_a_stop_while_a_goal_is_being_sent_stops_that_and_all_behind_it() -> None:
     async def work(robot: Robot, mover: Mover) -> None:
         robot.accepts.clear()
