@@ -27,6 +27,7 @@ from ophyd_async.core import init_devices
 from trirail import RefusedError, Robot, ServiceError, TrirailError
 from trirail.bluesky import Stage, UnfinishedError
 from trirail.bluesky import mover as mover_module
+from trirail.bluesky.flight import COLUMNS
 from trirail.bluesky.stage import StageLink
 from trirail.client import own_service
 from trirail.wire.messages import Event
@@ -788,7 +789,7 @@ def with_outputs(config: Path) -> None:
     config.write_text(text + '\n[outputs.strobe]\ndrive = "A"\nbit = 16\n', encoding="utf-8")
 
 
-def test_a_fly_scan_with_marks_collects_the_table_of_switches(engine: Any, tmp_path: Path) -> None:
+def test_fly_scans_with_marks_and_without_collect_in_one_run(engine: Any, tmp_path: Path) -> None:
     config, locator = own_service.private(tmp_path)
     with_outputs(config)
     with own_service.service(config, tmp_path / "session.rrd"), Robot("demo", locator) as robot:
@@ -796,14 +797,25 @@ def test_a_fly_scan_with_marks_collects_the_table_of_switches(engine: Any, tmp_p
             stage = Stage(robot)
         robot.enable()
         marks = [{"output": "strobe", "start": 0.002, "end": 0.018, "increment": 0.002, "pulse_width": 0.003}]
-        flight = stage.fly_to(0.02, 0.0, 0.0, marks=marks, speed=0.3, name="strobes")
-        flown = run(engine, bp.fly([flight]))
+        flights = [stage.fly_to(0.02, 0.0, 0.0, marks=marks, speed=0.3), stage.fly_to(0.0, 0.0, 0.0)]
+
+        def plan() -> Any:
+            yield from bps.open_run()
+            for flight in flights:
+                yield from bps.kickoff(flight, wait=True)
+                yield from bps.complete(flight, wait=True)
+                yield from bps.collect(flight)
+            yield from bps.close_run()
+
+        flown = run(engine, plan())
     found, stamps = pages(flown), pages(flown, "timestamps")
-    on = [x for x, value in zip(found["strobes-commanded_x"], found["strobes-value"], strict=True) if value]
+    assert found["stage-x"][-1] == pytest.approx(0.0, abs=HALF_WINDOW)
+    on = [x for x, value in zip(found["marked_flight-commanded_x"], found["marked_flight-value"], strict=True) if value]
     assert on == pytest.approx(np.arange(1, 10) * 0.002, abs=5e-4)
-    assert set(found["strobes-output"]) == {"strobe"}
-    assert all(column == found["strobes-time"] for column in stamps.values())
-    late = np.diff(found["strobes-time"]) - np.diff(found["strobes-t"])  # where ticks were missed, between two tables
+    assert set(found["marked_flight-output"]) == {"strobe"}
+    switched = [column for key, column in stamps.items() if key.startswith("marked_flight-")]
+    assert switched == [found["marked_flight-time"]] * len(COLUMNS)
+    late = np.diff(found["marked_flight-time"]) - np.diff(found["marked_flight-t"])
     assert np.median(np.abs(late)) < 1e-4
 
 

@@ -71,7 +71,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         """Whether the plan has paused since the last `kickoff`."""
         self._begun: AsyncStatus[None] | None = None
         self._stopping: asyncio.Task[None] | None = None
-        super().__init__(name)
+        super().__init__(name or ("marked_flight" if has_marks else "flight"))
 
     @property
     def _stage(self) -> Stage:

@@ -149,19 +149,20 @@ class Stage(Monitored, AsyncReadable, HasHints):
         await (await self.link()).robot.check(PoseGoal(x=x, y=y, phi=phi))
 
     def follow(
-        self, points: Points, *, marks: Sequence[MarkLike] = (), stretch: bool = False, name: str = "flight"
+        self, points: Points, *, marks: Sequence[MarkLike] = (), stretch: bool = False, name: str = ""
     ) -> Flight:
         """Return a fly scan along timed points, as in Robot.follow. The robot first moves to the first point.
 
         The scan collects the switches of outputs at its marks. If there are no marks, it collects the readings of every
-        state during the path.
+        state during the path. By default, the scan is named "flight", or "marked_flight" if it has marks, since one
+        stream cannot contain both.
         """
         rows, places = points_of(points), marks_of(marks)
         first = dict(enumerate((rows[0].x, rows[0].y, rows[0].phi)))
         return Flight(self, lambda robot: robot.follow(rows, stretch=stretch, marks=places), bool(places), name, first)
 
     def fly_to(
-        self, x: float, y: float, phi: float, *, marks: Sequence[MarkLike] = (), speed: float = 1, name: str = "flight"
+        self, x: float, y: float, phi: float, *, marks: Sequence[MarkLike] = (), speed: float = 1, name: str = ""
     ) -> Flight:
         """Return a fly scan to a pose on a straight path, as in Robot.move_to; the data are those of `follow`."""
         places = marks_of(marks)
