@@ -102,7 +102,11 @@ def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_Wrong
             if all(of_each):
                 # If the value has the shape of one of the types, its errors are the answer. Otherwise no type
                 # is closer than another.
-                inside = (errors for errors in of_each if all(wrong.place != place for wrong in errors))
+                inside = (
+                    errors
+                    for part, errors in zip(types, of_each, strict=True)
+                    if all(wrong.place != place for wrong in errors) or _is_table(part, value)
+                )
                 yield from next(inside, [_unexpected(value, kind, place)])
         case mi.StructType(), dict():
             yield from _wrong_fields(value, kind, place)
@@ -114,6 +118,10 @@ def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_Wrong
                 yield from _wrong_values(each, inner, (*place, index))
         case _ if not _accepts(kind, value):
             yield _unexpected(value, kind, place)
+
+
+def _is_table(kind: mi.Type, value: object) -> bool:
+    return isinstance(kind, mi.StructType) and isinstance(value, dict)
 
 
 def _wrong_fields(table: dict[str, Any], kind: mi.StructType, place: Place) -> Iterator[_WrongValue]:
