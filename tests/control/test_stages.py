@@ -150,6 +150,7 @@ WRONG = {
     ("jerk", "[]"): f"limits.slider.jerk = []: {ONE}",
     ("acceleration", "{ A = 1.0 }"): f"limits.slider.acceleration = {{'A': 1.0}}: {ONE}",
     ("velocity", '"fast"'): f"limits.slider.velocity = 'fast': {ONE}",
+    ("velocity", "250"): f"limits.slider.velocity = 250: {ONE}; each 1e-05 to 100",
     ("velocity", "true"): f"limits.slider.velocity = True: {ONE}",
     ("velocity", "[0.03, 0.02, -1]"): "limits.slider.velocity[2] = -1: expected number, 1e-05 to 100",
     ("velocity", "[0.03, nan, 0.1]"): "limits.slider.velocity[1] = nan: it must be a finite number",

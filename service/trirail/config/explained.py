@@ -212,8 +212,9 @@ def _unexpected(value: object, kind: mi.Type, place: Place) -> _WrongValue:
 def expected(kind: mi.Type) -> str:
     """Return a description of the values that a type accepts."""
     match kind:
-        case mi.Metadata(extra_json_schema={"description": words}):
-            return str(words)
+        case mi.Metadata(type=inner, extra_json_schema={"description": words}):
+            number = next((part for part in getattr(inner, "types", ()) if isinstance(part, mi.FloatType)), None)
+            return f"{words}; each {bounds(number).removeprefix(', ')}" if number is not None else str(words)
         case mi.UnionType(types=types):
             return " or ".join(expected(part) for part in types if not isinstance(part, mi.NoneType))
         case mi.LiteralType(values=values):
