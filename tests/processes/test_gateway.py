@@ -64,6 +64,8 @@ class Rig:
 
     def __init__(self, opened: zenoh.Session) -> None:
         self.link = FakeLink()
+        self.ready: list[int] = []
+        """Cycle of the record with which the gateway began to serve clients."""
         self.gateway = Gateway(CONFIG, self.link, lambda: None, opened, Guard(CONFIG))  # type: ignore[arg-type]
         self.gateway._requests._tickets = 0  # so that the first ticket is 1
 
@@ -82,6 +84,12 @@ class Rig:
     def hear(self, answer: Answer) -> None:
         """The loop says something."""
         self.gateway._handle_packet(packets.message(answer), lambda: None)
+
+    def record(self, cycle: int) -> None:
+        """The loop sends a record."""
+        rows = np.zeros(1, DTYPE)
+        rows["cycle"] = cycle
+        self.gateway._handle_packet(bytes((packets.Kind.RECORDS,)) + rows.tobytes(), lambda: self.ready.append(cycle))
 
     def accepted(self, ticket: int) -> None:
         self.hear(Accepted(ticket, GoalReply("g", 1.0)))
@@ -486,13 +494,39 @@ def test_info_follows_drives_that_are_set_up_later_and_nothing_is_declared_twice
     monkeypatch.setattr(rig.gateway._replies, "send", lambda _incoming, content: said.append(content))
     missing = (MissingProtection("A", "1006", "its monitoring of SYNC"),)
     rig.hear(Welcome((), 0.5))
+    rig.record(1)
     declared = list(rig.gateway._inbox._declared)
     rig.hear(Welcome((), 0.5, missing))
+    rig.record(2)
     assert rig.gateway._inbox._declared == declared
     rig.gateway._handle(came("info", "trirail/demo/info", b""))
     (info,) = said
     assert isinstance(info, Info)
     assert info.missing_protections == missing
+
+
+def test_clients_are_served_when_there_is_a_state_to_answer_them(rig: Rig) -> None:
+    rig.hear(Welcome((), 0.5))
+    assert not hasattr(rig.gateway._inbox, "_declared")
+    rig.record(1)
+    rig.record(2)
+    assert rig.ready == [1]
+
+
+def test_leases_from_before_the_gateway_withdraw_no_goals(rig: Rig) -> None:
+    def lease(number: int) -> None:
+        rig.hear(EventReport(Event("lease", "info", "of bob", user="bob", seq=number, t=0.1, cycle=1, time=1.0)))
+
+    rig.hear(Welcome((), 0.5, newest_event=7))
+    for number in range(MAX_GOALS_OF_USER + 2):
+        rig.goal(f"g{number}")
+    lease(7)
+    rig.accepted(1)
+    rig.gateway._requests.send_goals()
+    lease(8)
+    rig.accepted(2)
+    rig.gateway._requests.send_goals()
+    assert [withdrawn for _, withdrawn in rig.goals()] == [None] * (MAX_GOALS_OF_USER + 1) + ["of bob"]
 
 
 class EndedLoop(FakeLink):

@@ -138,6 +138,16 @@ def test_who_sends_more_than_his_pace_waits_and_nobody_else(inbox: Inbox, clock:
     assert len(list(inbox.next_messages(10_000))) == BURST
 
 
+def test_goals_wait_behind_the_stops_of_their_own_user_alone(inbox: Inbox) -> None:
+    for number in range(BURST + 10):
+        keep(inbox, "cmd", b"%d" % number, "eve", "stop")  # equal ones would be one
+    for user in ("eve", "ann"):
+        keep(inbox, "goal", user=user)
+    taken = [(incoming.user, incoming.kind) for incoming in inbox.next_messages(BURST + 20)]
+    assert taken == [("eve", "cmd")] * BURST + [("ann", "goal")]
+    assert inbox.due() > 0.0
+
+
 def test_what_is_more_than_was_taken_stays_readable(inbox: Inbox) -> None:
     for _ in range(3):
         keep(inbox, "goal")

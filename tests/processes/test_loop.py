@@ -209,7 +209,9 @@ def test_a_gateway_that_comes_anew_is_told_everything(shell: Shell, tmp_path: Pa
     shell.cycles(30)
     said = shell.said()
     assert isinstance(said[0], Welcome)
-    assert [answer.event.mode for answer in said if isinstance(answer, EventReport)] == ["enabling", "holding"]
+    events = [answer.event for answer in said if isinstance(answer, EventReport)]
+    assert [event.mode for event in events] == ["enabling", "holding"]
+    assert said[0].newest_event == events[-1].seq
 
 
 def test_a_lost_gateway_is_noticed(shell: Shell) -> None:

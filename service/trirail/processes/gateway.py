@@ -97,8 +97,10 @@ class Gateway:
         self._guard = guard
         self._loop_death = LoopDeath(config.period, last_cycle)
         self._info = info(config)
-        self._welcomed = False
-        """True once the loop has sent its welcome. Clients are served from then on."""
+        self._past_events = 0
+        """Number of the newest event from before this gateway was connected to the loop."""
+        self._welcomed = self._declared = False
+        """True once the loop has sent its welcome, and once clients are served, from the first record on."""
         self._states = StateMaker(config)
         self._meter = Meter(report_measurements) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
@@ -135,7 +137,7 @@ class Gateway:
         self._publications = Publications(session, self._robot, run)
 
     def serve(self, ready: Callable[[], None]) -> None:
-        """Serve clients until `end` is called or the loop disconnects. Call `ready` after the loop's welcome."""
+        """Serve clients until `end` is called or the loop disconnects. Call `ready` when clients are served."""
         stop_port = self._guard.stop_port(self._inbox.stop_at_port)
         poll = select.poll()
         poll.register(self._link.fileno(), select.POLLIN)
@@ -275,9 +277,8 @@ class Gateway:
         try:
             if packet[0] == Kind.RECORDS:
                 self._publish(content)
-                return
-            answer = decode_answer(content)
-            self._on_answer(answer)
+            else:
+                self._on_answer(decode_answer(content))
         except LinkClosed:
             raise
         except Exception as error:  # noqa: BLE001 - a restarted gateway would receive the same message again
@@ -285,20 +286,20 @@ class Gateway:
                 quoted(f"the gateway could not read a message of the loop, please report it: {error!r}")
             )
             return
-        if isinstance(answer, Welcome):
-            self._info = msgspec.structs.replace(self._info, missing_protections=answer.missing_protections)
-            if not self._welcomed:
-                self._welcomed = True
-                self._inbox.declare()
-                ready()
+        if self._welcomed and self._states.cycle and not self._declared:
+            self._declared = True
+            self._inbox.declare()
+            ready()
 
     def _on_answer(self, answer: Answer) -> None:
         self._loop_death.follow(answer)
         match answer:
             case EventReport(event):
                 self._handle_event(event)
-            case Status() | Welcome():
+            case Status():
                 self._states.update(answer)
+            case Welcome():
+                self._welcome(answer)
             case Accepted(ticket, reply):
                 self._requests.answer(ticket, msgspec.structs.replace(reply, run=self._run))
             case Checked(ticket, reply):
@@ -309,6 +310,12 @@ class Gateway:
             case Refused(ticket, code, text, slider, value, limit):
                 error = ErrorReply(code, text, slider, value, limit)
                 self._requests.answer(ticket, self._commands.refused(ticket, error))
+
+    def _welcome(self, welcome: Welcome) -> None:
+        self._states.update(welcome)
+        self._info = msgspec.structs.replace(self._info, missing_protections=welcome.missing_protections)
+        if not self._welcomed:
+            self._welcomed, self._past_events = True, welcome.newest_event
 
     def _publish(self, batch: memoryview) -> None:
         """Publish a batch of records and update the state from it; publish the newest state if that is due."""
@@ -335,8 +342,11 @@ class Gateway:
             self._publications.summary(summary_of(self._states.newest(), now - self._records_at, self._info.version))
 
     def _handle_event(self, event: Event) -> None:
-        """Publish and log an event. If the lease changes, withdraw the waiting goals of all users except the holder."""
-        if event.kind == "lease":
+        """Publish and log an event. If the lease changes, withdraw the waiting goals of all users except the holder.
+
+        A restarted gateway also receives past events, whose leases may have ended.
+        """
+        if event.kind == "lease" and event.seq > self._past_events:
             self._requests.backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
         self._log(event)

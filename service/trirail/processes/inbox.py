@@ -41,7 +41,7 @@ class Inbox:
     Users take turns, and the messages of each user are read at a limited rate, so that a flood of messages delays only
     its sender. Stops are recognised by their key, and are read before all other messages. Messages are numbered in the
     order of their arrival. The number of a stop shows which goals arrived before the stop. A goal that arrived after a
-    stop is never read before that stop.
+    stop is not read before that stop, unless the stop waits because another user has sent too many.
 
     Parameters
     ----------
@@ -142,11 +142,10 @@ class Inbox:
         return None
 
     def _readable(self) -> Iterator[str]:
-        """Yield users in the order of their turns. A user whose next message is a goal after a stop is left out."""
-        stop = min((self._stops.first(user)[0].number for user in self._stops.users), default=math.inf)
+        """Yield users in the order of their turns, except those whose next message is a goal after their own stop."""
         for user in self._others.users:
-            incoming = self._others.first(user)
-            if incoming.kind != "goal" or incoming.number < stop:
+            incoming, stops = self._others.first(user), user in self._stops.users
+            if not (incoming.kind == "goal" and stops and incoming.number > self._stops.first(user)[0].number):
                 yield user
 
     def _due(self, now: float) -> float:

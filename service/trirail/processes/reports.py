@@ -187,7 +187,7 @@ class Reports:
         """Accept new connections of the gateway and the recorder, and send them the welcome and the status."""
         for port in (self._gateway, self._recorder):
             if port.accept():
-                port.send(message(self._welcome))
+                port.send(message(msgspec.structs.replace(self._welcome, newest_event=self._events)))
                 port.send(message(self._status))
                 if port is self._gateway:
                     self._sent_events = 0

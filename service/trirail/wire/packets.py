@@ -116,6 +116,8 @@ class Welcome(Struct, frozen=True, tag=True):
     """Fraction of the bus capacity that the cycle uses in the worst case, 0 to 1."""
     missing_protections: tuple[MissingProtection, ...] = ()
     """Protections that the drives lack."""
+    newest_event: int = 0
+    """Number of the newest event from before the connection."""
 
 
 class EventReport(Struct, frozen=True, tag=True):
