@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 from rigs import Closing, DriverRig
+from trirail_drivers.odrive.flat_endpoints import KNOWN_TABLES, Endpoint
+from trirail_drivers.odrive.protections import ABSOLUTE_SETPOINTS
 
 
 @pytest.fixture
@@ -35,3 +37,10 @@ def enabled(ready: DriverRig[Any, Any]) -> DriverRig[Any, Any]:
     ready.enable()
     ready.bus.sent.clear()
     return ready
+
+
+@pytest.fixture
+def absolute_odrives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ODrives tell that their positions are absolute, as they do where a user gives their flat_endpoints.json."""
+    for table in KNOWN_TABLES:
+        monkeypatch.setitem(table.endpoints, ABSOLUTE_SETPOINTS, Endpoint(900, "bool"))

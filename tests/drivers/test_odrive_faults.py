@@ -36,6 +36,8 @@ from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.setpoints import SETTLE_TIME_S
 from trirail_drivers.simulated import SimulatedOdrive
 
+pytestmark = pytest.mark.usefixtures("absolute_odrives")
+
 ODRIVES = odrives(REAL)
 PERIOD = ODRIVES.period
 TURNS = ODRIVES.drives.A.counts_per_metre
@@ -447,6 +449,36 @@ def test_a_drive_that_has_restarted_finishes_its_start_before_it_is_configured(r
     rig.until(lambda: not rig.control.measured.unready, 5000)
     assert isinstance(rig.command("reset"), CommandDone)
     rig.enable()
+
+
+@pytest.mark.parametrize("stop", ["disable", "quick_stop"])
+def test_a_drive_that_gets_power_by_itself_is_not_sent_to_where_it_was_told_to_be_before(
+    rig: OdriveRig, stop: str
+) -> None:
+    rig.enable()
+    rig.order(stop)
+    rig.cycles(500)
+    drive, told = rig.odrives[1], [len(setpoints) for setpoints in rig.setpoints_of.values()]
+    drive.servo.position += 0.05 * TURNS  # pushed by hand
+    rig.cycles(100)
+    rig.inject("B drop set_axis_state")
+    drive.axis_state, drive._input = AxisState.CLOSED_LOOP_CONTROL, (drive.servo.position, 0.0)
+    place = drive.servo.position
+    rig.cycles(2500)
+    assert any("drive B: is in closed loop control" in notice.message for notice in rig.notices)
+    assert [len(setpoints) for setpoints in rig.setpoints_of.values()] == told
+    assert drive.servo.position == pytest.approx(place)
+
+
+def test_a_drive_that_restarts_in_motion_is_led_down_no_ramp(rig: OdriveRig) -> None:
+    begin(rig, "moving", "B reboot")
+    rig.until(rig.faulty, ASKED)
+    restarted = len(rig.rows)
+    rig.odrives[1].axis_state, rig.odrives[1]._booted = AxisState.CLOSED_LOOP_CONTROL, rig.now
+    rig.cycles(2 * BEAT)
+    assert [setpoint.cycle for setpoint in rig.setpoints_of[1] if setpoint.cycle >= restarted] == []
+    assert {state for at, state in rig.states_of[1] if at >= restarted - 1} == {AxisState.IDLE}
+    assert rig.setpoints_of[0][-1].cycle > restarted
 
 
 @pytest.mark.parametrize("mode", ["holding"])

@@ -25,11 +25,13 @@ from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.driver.recovery import RETRY_AFTER, STEP_BITS
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import cansimple
-from trirail_drivers.odrive.flat_endpoints import Version
-from trirail_drivers.odrive.protections import POSITION_STATUS, PROTECTIONS, RELATIVE_MODE, WATCHDOG
+from trirail_drivers.odrive.flat_endpoints import KNOWN_TABLES, Version
+from trirail_drivers.odrive.protections import ABSOLUTE_SETPOINTS, POSITION_STATUS, PROTECTIONS, RELATIVE_MODE, WATCHDOG
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedOdrive
 from trirail_drivers.simulated.device import Nmt
+
+pytestmark = pytest.mark.usefixtures("absolute_odrives")
 
 REAL = changed(CONFIG, missed_syncs=3)
 ODRIVES = odrives(REAL)
@@ -364,7 +366,9 @@ def test_an_odrive_may_be_replaced_where_the_configuration_allows_it() -> None:
     rig.cut(2)
     odrive.version, odrive.serial = before._replace(firmware=(0, 6, 99)), 7
     rig.supply(2)
-    rig.recover()
+    rig.until(rig.ready, ENDS)
+    assert isinstance(rig.command("reset"), CommandDone)
+    assert not rig.control.measured.homed
     assert rig.said("drive C: lacks endpoints")
     rig.bus.shutdown()
 
@@ -399,6 +403,26 @@ def relative_rig() -> AbsentRig:
     rig.supply(0)
     rig.recover()
     return rig
+
+
+@pytest.mark.parametrize(("turns", "moved", "homed"), [(2.5, 0.0, True), (2.5, 0.2, False), (0.5, 0.0, False)])
+def test_an_odrive_that_does_not_tell_whether_it_keeps_its_position_is_homed_only_where_that_is_seen(
+    turns: float, moved: float, homed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for table in KNOWN_TABLES:
+        monkeypatch.delitem(table.endpoints, ABSOLUTE_SETPOINTS)
+    rig = RecoveryRig(ODRIVES)
+    for drive in rig.bus.drives:
+        drive.servo.position = turns
+    rig.cycles(300)
+    rig.cut(0)
+    rig.bus.drives[0].servo.position += moved
+    rig.cycles(300)
+    rig.supply(0)
+    rig.until(rig.ready, ENDS)
+    assert isinstance(rig.command("reset"), CommandDone)
+    assert rig.control.measured.homed is homed
+    rig.bus.shutdown()
 
 
 def test_an_odrive_whose_position_is_relative_is_not_homed_after_a_restart() -> None:

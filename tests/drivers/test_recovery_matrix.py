@@ -26,6 +26,8 @@ from trirail_drivers.odrive.cansimple import Error
 from trirail_drivers.odrive.protections import WATCHDOG
 from trirail_drivers.simulated import SimulatedDrive, SimulatedOdrive
 
+pytestmark = pytest.mark.usefixtures("absolute_odrives")
+
 REAL = changed(CONFIG, missed_syncs=3)
 STILL: Final = 1e-6
 """A slider that moves by less than this does not move [m]: a servo settles, and counts are whole."""

@@ -363,6 +363,7 @@ def test_a_service_that_starts_without_a_bus_uses_it_when_it_appears(way: str, c
     rig.close()
 
 
+@pytest.mark.usefixtures("absolute_odrives")
 @pytest.mark.generated(0, 1, 2)
 def test_odrives_go_on_when_their_bus_is_back(seed: int) -> None:
     draw = random.Random(seed)

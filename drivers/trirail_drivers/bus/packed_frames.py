@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail_drivers.bus.can_frame import CANFD_FRAME, DATA_AT, HEADER
+from trirail_drivers.bus.can_frame import CANFD_FRAME, DATA_AT, HEADER, REMOTE
 from trirail_drivers.bus.frames import Frame, fd_packed
 
 
@@ -66,7 +66,8 @@ class PackedFrames:
         for row in self.frames[first:end]:
             packed = row.tobytes()
             identifier, length = HEADER.unpack_from(packed)
-            unpacked.append((identifier, bytearray(packed[DATA_AT : DATA_AT + length])))
+            end = DATA_AT + (0 if identifier & REMOTE else length)
+            unpacked.append((identifier, bytearray(packed[DATA_AT:end])))
         return unpacked
 
 

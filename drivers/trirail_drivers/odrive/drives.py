@@ -235,7 +235,7 @@ class Odrive(Driver[OdriveAxis]):
         if self._wire.fault is not None or self._enabled:
             return
         self._enabled = True
-        self._setpoints.begin()
+        self._setpoints.forget()
         for axis in self._axes:
             axis.powered_up = False
             axis.left_out = alone not in (None, axis.name)
@@ -254,7 +254,7 @@ class Odrive(Driver[OdriveAxis]):
         """
         self._start_stop_timer("disable")
         self._enabled = False
-        self._setpoints.abandon()
+        self._setpoints.forget()
         self._request_states()
 
     def quick_stop(self) -> None:
@@ -266,12 +266,10 @@ class Odrive(Driver[OdriveAxis]):
         if self._setpoints.stopping:
             return
         self._start_stop_timer("quick stop")
-        powering = self._enabled or self._powered()
         self._enabled = False
-        if not self._setpoints.sent or not powering:
-            self._request_states()
-        else:
+        if self._setpoints.sent:
             self._setpoints.stop()
+        self._request_states()
 
     def reset(self) -> None:
         """Clear the latched fault and the errors of the drives, without powering up.
@@ -311,7 +309,7 @@ class Odrive(Driver[OdriveAxis]):
         return axis.powered
 
     def _abandon_stop(self) -> None:
-        self._setpoints.abandon()
+        self._setpoints.forget()
 
     def _find_fault(self, now: float) -> DriveFault | None:
         """Return the first fault of a drive, or None. A following error outside its window is also a fault."""
@@ -350,7 +348,7 @@ class Odrive(Driver[OdriveAxis]):
 
     def _target_state(self, axis: OdriveAxis) -> AxisState | None:
         """Return the state in which a drive should be now, or None if its present state should not change."""
-        if self._enabled and axis.left_out:
+        if axis.restarted or (self._enabled and axis.left_out):
             return AxisState.IDLE
         if not self._enabled:
             return None if self._setpoints.stopping else AxisState.IDLE

@@ -34,8 +34,8 @@ FROM_POWER_ON: Final = (
 )
 """Note about a drive whose positions do not refer to its encoder."""
 UNCHECKED: Final = (
-    f"{ABSOLUTE_SETPOINTS} must be True, but has no known endpoint number; check it with odrivetool, or set endpoints "
-    "to its flat_endpoints.json"
+    f"{ABSOLUTE_SETPOINTS} must be True, but has no known endpoint number; set endpoints to its flat_endpoints.json, "
+    "or else it may count as not homed after a restart"
 )
 """Note about a drive that may lose its position with its supply."""
 SETTINGS: Final = (WATCHDOG, WATCHDOG_TIMEOUT, SCALE, HEARTBEAT, *CYCLIC, POSITION_STATUS, ABSOLUTE_SETPOINTS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Any, Final
 
 from trirail_drivers.bus.frames import FrameSender
 from trirail_drivers.driver.duplicate_node import far_apart
@@ -16,6 +16,13 @@ from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.client import OdriveClient
 from trirail_drivers.odrive.protections import MAY_SEND_UNASKED
 from trirail_drivers.odrive.setup import OdriveIdentity, OdriveSetup, OdriveSetupTask, OdriveStart, configure_one
+
+COUNTED_TURNS: Final = 1.0
+"""Distance from zero [turns] at which a position does not count from the place where the drive was switched on, if the
+slider has not moved.
+"""
+UNMOVED_TURNS: Final = 0.1
+"""Difference of positions of a slider that has not moved [turns]."""
 
 
 class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
@@ -49,8 +56,11 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         A drive whose position is relative counts as not homed after every set-up except the first, which accepts the
         position as it is: the drive has restarted, or it may have lost its supply and finished booting while silent.
         """
+        relative, last = made.relative, self.axis.scale.exact(self.axis.position)
+        if relative is None:
+            relative = not (self.axis.homed and _has_kept(last, begun.turns))
         self._configured(begun)
-        self.axis.homed = self.setup is None or not made.relative
+        self.axis.homed = self.setup is None or not relative
         return ""
 
     def may_have_power(self, *, stopping: bool) -> bool:
@@ -73,3 +83,8 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         allowed = self.one.drive.allow_replacement
         if text := replacement_refusal(self.axis.name, numbers, ("firmware", "serial number"), allowed=allowed):
             raise DriveError(text)
+
+
+def _has_kept(last: float, turns: float) -> bool:
+    """Whether a drive has certainly kept its position, given the positions before and after a restart [turns]."""
+    return abs(turns) > COUNTED_TURNS and abs(turns - last) < UNMOVED_TURNS

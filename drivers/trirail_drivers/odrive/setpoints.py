@@ -52,8 +52,11 @@ class SetpointSender:
         """Whether the drives have received setpoints since they were enabled."""
         return not math.isnan(self._axes[0].sent)
 
-    def begin(self) -> None:
-        """Forget earlier setpoints before the drives are powered up."""
+    def forget(self) -> None:
+        """Forget the setpoints sent, and abandon a ramp, since the drives get or lose their power.
+
+        A drive that then has power by itself must not be sent to an earlier position.
+        """
         self._standstill_time = None
         for axis in self._axes:
             axis.sent = axis.sent_rate = axis.in_force = math.nan
@@ -84,27 +87,26 @@ class SetpointSender:
         return 0
 
     def stop(self) -> None:
-        """Begin the ramp of a quick stop now, if the drives have received setpoints."""
-        if not self.sent:
-            return
+        """Begin the ramp of a quick stop now; the drives must have received setpoints."""
         self._standstill_time = 0.0
         # The position setpoint does not change yet; the velocity feed-forward decreases from now on.
         self._send([(axis.in_force, self._braked_setpoint(axis)[1]) for axis in self._axes])
         for axis in self._axes:
             axis.wanted = math.nan
 
-    def abandon(self) -> None:
-        """Abandon the ramp."""
-        self._standstill_time = None
-
     def _send(self, setpoints: Sequence[tuple[float, float]], sent: int = 0) -> None:
-        """Send setpoints except the first `sent`, which are already on the bus. Each takes effect when it arrives."""
+        """Send setpoints except the first `sent`, which are already on the bus. Each takes effect when it arrives.
+
+        A drive that has restarted is sent none, since its positions may count from another place.
+        """
         for axis, (metres, rate) in zip(self._axes, setpoints, strict=True):
             axis.sent, axis.sent_rate = metres, rate
             if math.isnan(axis.in_force):
                 axis.in_force = metres
         stopping = self.stopping
         for number, (axis, (metres, rate)) in enumerate(zip(self._axes, setpoints, strict=True)):
+            if axis.restarted:
+                continue
             scale_setpoint(axis, metres, rate)
             put_setpoint(axis, self._frames.frames[number, DATA_AT:])
             if number < sent or self._wire.send(self._frames.frame(number)):
@@ -129,7 +131,7 @@ class SetpointSender:
             return
         self._standstill_time += self.period
         if self._standstill_time > SETTLE_TIME_S:
-            self._standstill_time = None
+            self.forget()
 
     def _braked_setpoint(self, axis: OdriveAxis) -> tuple[float, float]:
         """Return the ramp's next setpoint, one period after the position that the bus accepted last."""

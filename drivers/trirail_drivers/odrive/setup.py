@@ -82,8 +82,8 @@ class OdriveSetup(NamedTuple):
 
     name: str
     identity: OdriveIdentity
-    relative: bool
-    """Whether the drive loses its position when it loses its supply."""
+    relative: bool | None
+    """Whether the drive loses its position when it loses its supply; None if this is not known."""
     missing_protections: tuple[str, ...]
     """Protections that the drive lacks, by their names in `accept_without`."""
     notes: tuple[str, ...]
@@ -156,10 +156,11 @@ async def configure_one(
     turns, _ = _unpacked(client, cansimple.ESTIMATES, estimates)
     if not math.isfinite(turns):
         raise DriveError(f"drive {name}: position estimate is {turns}; check that its encoder has been calibrated")
-    relative = relative_position(read)
-    unchecked = UNCHECKED if read is not None and ABSOLUTE_SETPOINTS not in read else ""
-    notes += [note for note in (relative, unchecked) if note]
-    made = OdriveSetup(name, OdriveIdentity(version, serial), bool(relative), tuple(lacks), tuple(notes))
+    reason = relative_position(read)
+    known = read is not None and ABSOLUTE_SETPOINTS in read
+    relative = True if reason else False if known else None
+    notes += [note for note in (reason, "" if known or read is None else UNCHECKED) if note]
+    made = OdriveSetup(name, OdriveIdentity(version, serial), relative, tuple(lacks), tuple(notes))
     return made, OdriveStart(turns, errors[0] | errors[1], state)
 
 
