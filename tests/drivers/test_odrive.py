@@ -28,6 +28,7 @@ from trirail_drivers.odrive.codes import describe_errors
 from trirail_drivers.odrive.drives import MODES_SENT, Odrive
 from trirail_drivers.odrive.flat_endpoints import Version
 from trirail_drivers.odrive.other_masters import check_exclusive
+from trirail_drivers.odrive.protections import HEARTBEAT
 from trirail_drivers.odrive.setpoints import SETTLE_TIME_S
 from trirail_drivers.simulated import SimulatedOdrive
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
@@ -188,6 +189,46 @@ class TestConfigure:
         said = r"^drive B: has no Get_Version; its firmware is too old; update to 0\.6\.0 or newer$"
         with pytest.raises(DriveError, match=said):
             new.drives.configure(PERIOD, awaits=awaits)
+
+    @pytest.mark.parametrize("after", [0.002, 0.004, 0.006, 0.008, 0.01, 0.02, 0.03])
+    def test_a_drive_that_is_switched_on_meanwhile_is_not_too_old(self, new: Rig, after: float) -> None:
+        device = new.devices[1]
+        device.silent, end, poll = True, new.clock.now + after, device.poll
+
+        def switch_on(now: float) -> None:
+            device.silent = now < end
+            poll(now)
+
+        device.poll = switch_on  # type: ignore[method-assign]
+        new.drives.configure(PERIOD, awaits=True)
+
+    @pytest.mark.parametrize("rate_hz", [10, 20, 100])
+    @pytest.mark.parametrize("phase", range(4))
+    def test_a_reset_has_time_for_three_questions_at_every_rate(
+        self, closing: Closing, rate_hz: int, phase: int
+    ) -> None:
+        rig = closing(Rig(msgspec.structs.replace(CONFIG, heartbeat=1.0), watchdog=0.5))
+        for device in rig.devices:
+            device.settings[HEARTBEAT] = 1000.0
+        rig.period = 1.0 / rate_hz
+        rig.drives.configure(rig.period)
+        rig.cycles(rate_hz + phase)
+        rig.devices[1].fail(Error.DC_BUS_UNDER_VOLTAGE)
+        rig.found("fault", within=2 * rate_hz)
+        rig.cycles(phase)
+        rig.drives.reset()
+        assert [rig.cycle().fault for _ in range(2 * rate_hz)] == [None] * 2 * rate_hz
+
+    def test_a_drive_that_is_not_heard_any_more_is_not_said_to_have_power_now(self, ready: Rig) -> None:
+        ready.enable()
+        ready.devices[0].silent = True
+        ready.found("silent", within=10)
+        ready.cycles(1500)
+        fault = ready.cycle().fault
+        assert fault is not None
+        assert (
+            fault.message == "drive A: was in closed loop control when last heard; expected idle 1 s after quick stop"
+        )
 
     def test_a_drive_that_was_disarmed_while_it_booted_is_not_booting(self, new: Rig) -> None:
         """Its disarm reason is an error like any other: reported, and cleared by a reset."""

@@ -393,6 +393,29 @@ def test_settings_that_read_back_different_are_named_and_the_service_stays() -> 
     rig.bus.shutdown()
 
 
+def test_an_odrive_that_does_not_say_who_it_is_is_asked_again() -> None:
+    rig = RecoveryRig(ODRIVES)
+    drive = rig.bus.drives[2]
+    assert isinstance(drive, SimulatedOdrive)
+    answer, left = drive._answer, [4]
+
+    def lose_addresses(command: int) -> None:
+        if command == cansimple.ADDRESS and left[0]:
+            left[0] -= 1
+            return
+        answer(command)
+
+    holding(rig)
+    rig.cut(2)
+    rig.cycles(300)
+    drive._answer = lose_addresses  # type: ignore[method-assign]
+    rig.supply(2)
+    rig.recover()
+    assert left == [0]
+    assert not rig.said("has been replaced")
+    rig.bus.shutdown()
+
+
 def relative_rig() -> AbsentRig:
     """A robot of ODrives, of which drive A has a relative position."""
     rig = AbsentRig((0,), ODRIVES)

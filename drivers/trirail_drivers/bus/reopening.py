@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import threading
+import time
 from collections.abc import Callable
 from typing import Final
 
@@ -28,9 +29,10 @@ class AbsentBus(can.BusABC):
         """Refuse to send a frame."""
         raise can.CanOperationError(f"{self.channel_info} is not open")
 
-    def recv(self, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
-        """Return None, since no frame can arrive."""
-        return
+    def recv(self, timeout: float | None = None) -> None:
+        """Return None after `timeout` [s], since no frame can arrive."""
+        if timeout:
+            time.sleep(timeout)
 
 
 def start_thread(work: Callable[[], None]) -> None:

@@ -510,7 +510,7 @@ class Cia402Axis(Axis):
         """
         if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
             return None
-        text = f"is {self.state} {seconds:g} s after {wanted}; expected switch on disabled"
+        text = self.describe_overdue_stop(str(self.state), "switch on disabled", wanted, seconds)
         if not self.statusword & canopen_frames.REMOTE:
             text += f"; it may be under local control: bit 9 (remote) of statusword {self.statusword:04X} is clear"
         return self.make_fault("timeout", 0, text)

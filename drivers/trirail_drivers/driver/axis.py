@@ -145,6 +145,12 @@ class Axis(Answers):
         """
         raise NotImplementedError
 
+    def describe_overdue_stop(self, state: str, expected: str, wanted: str, seconds: float) -> str:
+        """Return the text of `stop_overdue_fault`, given the drive's last known and expected states in words."""
+        if self.present:
+            return f"is {state} {seconds:g} s after {wanted}; expected {expected}"
+        return f"was {state} when last heard; expected {expected} {seconds:g} s after {wanted}"
+
     def silence_fault(self, now: float) -> DriveFault | None:
         """Return a fault if positions or heartbeats are overdue at time `now` [s]."""
         if (missed := self.missed) >= self._missed_positions:

@@ -17,8 +17,8 @@ from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.codes import describe_errors
 
-RESET_TIME = 3 * 3 * cansimple.ERROR_PERIOD
-"""Time after Clear_Errors during which errors do not yet count as a fault [s]: three error requests to each drive."""
+RESET_REQUESTS = 3 * 3
+"""Number of error requests after Clear_Errors during which errors do not yet count as a fault: three to each drive."""
 STALE_HEARTBEATS = 1
 """Number of heartbeats after a request for a new axis state that may still show the previous state."""
 ENABLE_ATTEMPTS = 2
@@ -217,7 +217,7 @@ class OdriveAxis(Axis):
         """
         if not self.powered:
             return None
-        text = f"is in {cansimple.state_name(self.state)} {seconds:g} s after {wanted}; expected idle"
+        text = self.describe_overdue_stop(f"in {cansimple.state_name(self.state)}", "idle", wanted, seconds)
         return self.make_fault("timeout", 0, text)
 
     @property

@@ -27,7 +27,7 @@ from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.driver.row_updates import count_sync, due_setpoint, end_reading
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Travel, Triple
 from trirail_drivers.odrive import cansimple, setup
-from trirail_drivers.odrive.axis import RESET_TIME, OdriveAxis
+from trirail_drivers.odrive.axis import RESET_REQUESTS, OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.cycle_tables import CycleTableWriter
 from trirail_drivers.odrive.other_masters import listen_for_masters
@@ -286,7 +286,7 @@ class Odrive(Driver[OdriveAxis]):
             axis.event = None
             if axis.errors or not self._enabled:  # errors of a drive that has lost power may not be known yet
                 if now >= axis.reset_until:  # a reset under way gets no more time, so that its failure becomes known
-                    axis.reset_until = now + RESET_TIME
+                    axis.reset_until = now + RESET_REQUESTS * max(cansimple.ERROR_PERIOD, self._period)
                 self._clear_errors(axis)
 
     def _clear_errors(self, axis: OdriveAxis) -> None:

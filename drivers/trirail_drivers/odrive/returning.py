@@ -10,7 +10,7 @@ from trirail_drivers.bus.frames import FrameSender
 from trirail_drivers.driver.duplicate_node import far_apart
 from trirail_drivers.driver.recovery import ReturningDrive
 from trirail_drivers.driver.refusals import replacement_refusal
-from trirail_drivers.errors import DriveError
+from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import Clock
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.client import OdriveClient
@@ -70,10 +70,15 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         return self.axis.powered
 
     def _check(self, identity: OdriveIdentity) -> None:
-        """Raise DriveError if the drive is neither the previous drive nor a permitted replacement."""
+        """Raise DriveError if the drive is neither the previous drive nor a permitted replacement.
+
+        Raises DriveTimeout if the drive has not reported its serial number, but has done so before.
+        """
         if self.setup is None:
             return
         before = self.setup.identity
+        if before.serial is not None and identity.serial is None:
+            raise DriveTimeout(self.axis.name, "answer to Address", self.one.drives.sdo_timeout)
         names = "firmware", "hardware"
         numbers: dict[str, tuple[object, object]] = dict(
             zip(names, zip(before.version.dotted, identity.version.dotted, strict=True), strict=True)

@@ -170,11 +170,14 @@ async def _read_version(one: OdriveSetupTask) -> Version:
     answers = await client.request_all(cansimple.GET_VERSION)
     if not answers:
         has_heartbeat = await client.heartbeat(deadline) is not None
-        if has_heartbeat and await client.try_request(cansimple.GET_ENCODER_ESTIMATES) is not None:
+        # The drive may have been switched on after the first requests.
+        answers = await client.request_all(cansimple.GET_VERSION) if has_heartbeat else []
+        if has_heartbeat and not answers and await client.try_request(cansimple.GET_ENCODER_ESTIMATES) is not None:
             raise DriveError(
                 f"drive {client.name}: has no Get_Version; its firmware is too old; update to 0.6.0 or newer"
             )
-        raise client.timeout_error("Get_Version")
+        if not answers:
+            raise client.timeout_error("Get_Version")
     versions = [Version.from_fields(*_unpacked(client, cansimple.VERSION, answer)) for answer in answers]
     _check_single(client, [version.description for version in versions])
     return versions[0]
