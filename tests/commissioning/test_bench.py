@@ -6,13 +6,19 @@ import contextlib
 from collections.abc import Iterator
 
 import msgspec
+import numpy as np
 import pytest
+from commissioning.test_guide import ROBOT as GUIDED
+from commissioning.test_guide import Beside, odrives, with_drives
 from drivers.test_cia402 import CONFIG, Rig
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.commissioning.bench import Bench, DrivesStoppedError
-from trirail.config import SIM, load
+from trirail.commissioning.opening import open_steps
+from trirail.config import SIM, Config, load
+from trirail_drivers.config import Homing
 from trirail_drivers.interface import PowerState
+from trirail_drivers.simulated import SimulatedBus
 from trirail_drivers.simulated.device import Nmt
 
 ROBOT = msgspec.structs.replace(load(SIM), drives=CONFIG)
@@ -101,3 +107,49 @@ def test_a_drive_that_leaves_nmt_operational_with_power_is_named(state: Nmt, kee
             leave()
         assert (drive.state is PowerState.OPERATION_ENABLED) is keeps_power
         assert ("drive A STILL HAS POWER" in str(stopped.value)) is keeps_power
+
+
+@pytest.mark.parametrize("robot", [GUIDED, odrives()], ids=["cia402", "odrive"])
+@pytest.mark.parametrize("speed", [0.02, -0.1])
+def test_a_slider_that_runs_away_from_a_stop_loses_its_power(robot: Config, speed: float) -> None:
+    """Its motor has wrong phases: no ramp brakes it."""
+    with open_steps(robot, [f"when A enabled A runaway {speed}"], Beside(), lambda: False, lambda _: None) as steps:
+        steps.session.set_up()
+        rules, bus = steps.session.environment.rules, steps.session.environment.bus
+        assert rules is not None
+        assert isinstance(bus, SimulatedBus)
+        start = rules.read()[0]
+        judgement, _ = steps.power("A")
+        assert abs(rules.read()[0] - start) < 0.01
+        assert PowerState.OPERATION_ENABLED not in [drive.power for drive in bus.drives]
+    assert judgement.verdict == "failed"
+    assert "following error" in judgement.words[0]
+    assert "slider A: ran on by" in judgement.words[0]
+
+
+def test_a_stop_of_a_homing_is_left_its_ramp() -> None:
+    """At this speed, the ramp takes more than the travel that a slider may run on."""
+    homing = Homing(method=19, speed_switch=0.2, speed_zero=0.005, acceleration=5.0)
+    robot = with_drives(GUIDED, homing=homing)
+    simulated = msgspec.structs.replace(robot.can.simulated, start=(0.2, 0.0, 0.0))
+    robot = msgspec.structs.replace(robot, can=msgspec.structs.replace(robot.can, simulated=simulated))
+    pressed = False
+    with open_steps(robot, [], Beside(), lambda: pressed, lambda _: None) as steps:
+        steps.session.set_up()
+        bench, rules = steps.session.bench(), steps.session.environment.rules
+        assert rules is not None
+        start, positions = rules.read()[0], [rules.read()[0]]
+
+        def write(*setpoints: tuple[float, float, float]) -> None:
+            nonlocal pressed
+            positions.append(rules.read()[0])
+            pressed = pressed or abs(positions[-1] - start) > 0.03
+            apply(*setpoints)
+
+        apply = bench._drives.write
+        vars(bench._drives).update(write=write)
+        with pytest.raises(KeyboardInterrupt) as stopped:
+            steps.home("A")
+    speeds = np.abs(np.diff(positions)) / robot.period
+    assert speeds.max() > 0.19
+    assert "ran on" not in str(stopped.value)

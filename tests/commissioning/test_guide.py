@@ -570,10 +570,10 @@ def test_ctrl_c_twice_names_the_drive_that_has_power(tmp_path: Path, monkeypatch
     """The second one comes while the drives stop."""
     pressed, wait = [False], benches.Bench._wait_without_power
 
-    def interrupted(self: benches.Bench) -> None:
+    def interrupted(self: benches.Bench, *limit: float) -> bool:
         if pressed[0]:
             raise KeyboardInterrupt
-        wait(self)
+        return wait(self, *limit)
 
     def press(self: benches.Bench, *rates: object) -> object:
         pressed[0] = pressed[0] or self.max_errors[0] > 0.0

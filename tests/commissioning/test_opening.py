@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from typing import NoReturn
 
 import msgspec
 import pytest
@@ -43,7 +44,7 @@ def press_ctrl_c() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
-def interrupt() -> None:
+def interrupt() -> NoReturn:
     """End the closing of a driver, in the way of a handler that nothing has replaced."""
     raise KeyboardInterrupt("held down")
 

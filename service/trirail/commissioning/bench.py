@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -10,7 +11,7 @@ from typing import Final, NamedTuple, NoReturn
 import numpy as np
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
-from trirail.commissioning.moves import SlowMove
+from trirail.commissioning.moves import MAX_VELOCITY, SlowMove
 from trirail.config import Config
 from trirail.kinematics.arrays import Array
 
@@ -20,6 +21,10 @@ MAX_FOLLOWING_ERROR_M: Final = 0.0003
 At 5 mm/s, a drive without velocity feed-forward and with a position-loop gain of 20 /s lags by 0.25 mm."""
 SETTLE_TIME_S: Final = 0.3
 """Time within which a slider settles after a motion [s]."""
+MAX_STOP_TRAVEL_M: Final = 0.001
+"""Travel during a stop, beyond that of the quick-stop ramp, above which the power is cut [m].
+
+A motor with wrong phases, or one that counts against its encoder, cannot brake by a ramp."""
 INTERRUPTED: Final = "stopped by Ctrl-C"
 REST_CHECK_S: Final = 0.05
 """Time for which the sliders are observed before power is applied [s]."""
@@ -318,23 +323,43 @@ class Bench:
 
     def _stop_and_raise(self, reason: str, error: type[DrivesStoppedError] = DrivesStoppedError) -> NoReturn:
         """Stop all drives; raise `error`, or a plain DrivesStoppedError if a drive has a fault or still has power."""
-        self._stop()
+        reason += self._stop()
         described = self._describe(reason)
         if self._interrupted():
             raise KeyboardInterrupt(described)
         raise (error if described == reason else DrivesStoppedError)(described)
 
-    def _stop(self) -> None:
+    def _stop(self) -> str:
+        """Stop all drives by their ramps; cut the power if a slider runs on. Return its travel in words, or ""."""
+        speed = MAX_VELOCITY
+        if self.feedback.homing:
+            homing = [self.config.drives.each[index].homing for index in self._powered]
+            speed = max([speed, *(max(each.speed_switch, each.speed_zero) for each in homing if each is not None)])
+        ramp = speed**2 / (2.0 * self.config.drives.quick_stop_deceleration)
+        start = self.feedback.position
         self._drives.quick_stop()
+        if self._wait_without_power(MAX_STOP_TRAVEL_M + ramp):
+            return ""
+        travels = [(now - was) * 1e3 for now, was in zip(self.feedback.position, start, strict=True)]
+        self._drives.disable()
         self._wait_without_power()
+        travel, label = max(zip(travels, self._labels, strict=True), key=lambda each: abs(each[0]))
+        return f"; slider {label}: ran on by {travel:.3f} mm, so all power was cut"
 
-    def _wait_without_power(self) -> None:
-        """Run cycles until no drive has power, at most for `drives.stop_timeout` plus SETTLE_TIME_S."""
+    def _wait_without_power(self, max_travel: float = math.inf) -> bool:
+        """Run cycles until no drive has power, at most for `drives.stop_timeout` plus SETTLE_TIME_S.
+
+        Return False as soon as a slider has moved more than `max_travel` [m].
+        """
         self._powered = ()
+        start = self.feedback.position
         for _ in range(round((self.config.drives.stop_timeout + SETTLE_TIME_S) / self.period)):
             self._tick()
             self._drives.sync()
             self.feedback = self._drives.read()
             self._drives.write(self.feedback.position, _ZERO_VELOCITY)
             if not any(state in _POWERED_STATES for state in self.feedback.state):
-                return
+                break
+            if any(abs(now - was) > max_travel for now, was in zip(self.feedback.position, start, strict=True)):
+                return False
+        return True

@@ -43,7 +43,7 @@ def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judge
         return Judgement(
             "failed",
             (stopped,),
-            f"check drive {drive}: supply, safe torque off, brake, tuning; then repeat this step",
+            f"check drive {drive}: supply, safe torque off, brake, motor phases, tuning; then repeat this step",
         )
     return Judgement(
         "ok", (f"drive {drive} held for {seconds:g} s, within {drift * 1e3:.4f} mm; the others had no power",)
