@@ -19,6 +19,7 @@ import pytest
 from control_rig import CONFIG
 from trirail.commissioning import bench as benches
 from trirail.commissioning import opening
+from trirail.commissioning.bench import DrivesStoppedError
 from trirail.commissioning.guide import Guide
 from trirail.commissioning.judgement import Judgement
 from trirail.commissioning.observer import Observer
@@ -156,6 +157,7 @@ def test_drives_that_are_to_be_homed_are_homed_one_by_one(tmp_path: Path) -> Non
     robot = msgspec.structs.replace(robot, can=msgspec.structs.replace(robot.can, simulated=start))
     run = Run(tmp_path, robot)
     assert run.keeper.report.complete, run.person.lines
+    assert run.steps.session.bench().feedback.homed == (True, True, True)
     for name, way in zip(NAMES, (-0.01, -0.02, -0.03), strict=True):
         assert run.of("home", name).measured["way"] == pytest.approx(way, abs=2e-3)
 
@@ -176,6 +178,55 @@ def test_the_travel_of_a_homing_is_not_derived_from_an_encoder_whose_zero_moves(
         assert abs(rules.read()[0] - before) == pytest.approx(0.012 if method == 19 else 0.0, abs=2e-3)
     assert (judgement.verdict, measured["way"]) == ("ok", None)
     assert re.fullmatch(r"drive A reports home; slider A is at [+-]\d\.\d+ mm", judgement.words[0])
+
+
+@pytest.mark.parametrize(("step", "motions"), [("square", 0), ("kind", 0), ("kind", 1)])
+def test_the_platform_does_not_move_after_a_drive_has_lost_its_home(step: str, motions: int) -> None:
+    """Drive A restarts before the step, or after `motions` of it, and counts from where its slider is."""
+
+    class Restarter(Beside):
+        def ask(self, question: Question, idle: Callable[[], object]) -> str:
+            answer = super().ask(question, idle)
+            if sum("the sliders move" in asked for asked in self.asked) == motions + 1 and not restarted:
+                restart()
+            return answer
+
+    def restart() -> None:
+        bus.faults.add("A reboot")
+        bench.wait(0.01)
+        servo = bus.drives[0].servo
+        servo.shift(-servo.position)
+        bench.wait(4.0)
+        restarted.append(rules.read())
+
+    restarted: list[tuple[float, ...]] = []
+    robot = with_drives(ROBOT, homing=HOMING)
+    with open_steps(robot, [], Restarter(), lambda: False, sleep=lambda _: None) as steps:
+        steps.session.set_up()
+        bench, environment = steps.session.bench(), steps.session.environment
+        assert isinstance(environment.bus, SimulatedBus)
+        assert environment.rules is not None
+        bus, rules = environment.bus, environment.rules
+        for name in NAMES:
+            assert steps.home(name)[0].verdict == "ok"
+        rules.push(0, 0.02)
+        bench.wait(0.1)
+        if motions == 0:
+            restart()
+        judgement, _ = getattr(steps, step)()
+        assert rules.read() == pytest.approx(restarted[0], abs=2e-5)
+    assert judgement.verdict == "failed"
+    assert "drive A is not homed: repeat its home step" in judgement.words[0]
+
+
+def test_a_drive_without_homing_that_has_lost_its_position_is_set_up_again() -> None:
+    with open_steps(odrives(), [], Beside(), lambda: False, sleep=lambda _: None) as steps:
+        steps.session.set_up()
+        bench = steps.session.bench()
+        bench.check_homed()
+        bench.feedback = bench.feedback._replace(homed=(True, False, True))
+        with pytest.raises(DrivesStoppedError, match="drive B is not homed: repeat the set-up to accept its position"):
+            bench.check_homed()
 
 
 # ---------------------------------------------------------------------- faults, found and named

@@ -45,7 +45,7 @@ def commission(
     It moves one drive at a time, 1 mm at 5 mm/s, and asks before each step.
 
     The steps are: find the nodes on the bus, set up the drives, move each slider by hand, switch on the power of one
-    drive alone, move it 1 mm there and back, home, test the watchdogs, move the platform along a square, and determine
+    drive alone, move it 1 mm there and back, test the watchdogs, home, move the platform along a square, and determine
     the kind of mechanism. The command then writes a new configuration with the results. You can refuse and repeat every
     step. Ctrl-C stops all drives immediately. A report is saved. Answers are lines of standard input, from a person or
     a script. The exit code is 0 only if no step found an error. Stop the service first.

@@ -131,6 +131,13 @@ class Bench:
         if problem := self._describe():
             raise DrivesStoppedError(problem)
 
+    def check_homed(self) -> None:
+        """Raise DrivesStoppedError if the position of a drive is unknown because the drive is not homed."""
+        for name, drive, homed in zip(NAMES, self.config.drives.each, self.feedback.homed, strict=True):
+            if not homed:
+                remedy = "repeat the set-up to accept its position" if drive.homing is None else "repeat its home step"
+                raise DrivesStoppedError(f"drive {name} is not homed: {remedy}")
+
     def cycle(self, rates: Triple = _ZERO_VELOCITY) -> Feedback:
         """Run one cycle; send their target positions and the target velocities `rates` [m/s] to powered drives.
 
@@ -177,10 +184,13 @@ class Bench:
         ------
         DrivesStoppedError
             If a slider moves before power is applied, if a drive is not enabled within `watchdogs.enable_timeout`, if
-            the drives report a fault, or if a drive has power before it is enabled or after it is disabled.
+            the drives report a fault, or if a drive has power before it is enabled or after it is disabled. Also if
+            `alone` is None and a drive is not homed.
         """
         self.max_errors = [0.0, 0.0, 0.0]
         self.clear_fault()
+        if alone is None:
+            self.check_homed()
         before = self.feedback.position
         for name, was, now in zip(self._labels, before, self.wait(REST_CHECK_S).position, strict=True):
             if abs(now - was) > MAX_FOLLOWING_ERROR_M / 3.0:

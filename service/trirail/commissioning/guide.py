@@ -166,6 +166,19 @@ def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
         for name in NAMES
         if steps.session.reports_inputs
     ]
+    # Before homing, since a drive that has left NMT operational is no longer homed.
+    plan += [
+        GuideStep(
+            "watchdog",
+            name,
+            f"Watchdog of {named(name)}",
+            f"POWER on drive {name}, then SYNC and heartbeat end: it must switch its power off by itself.",
+            partial(steps.watchdog, name),
+            (("power", name),),
+            (("push", name), ("move", name)),
+        )
+        for name in NAMES
+    ]
     plan += [
         GuideStep(
             "home",
@@ -178,18 +191,6 @@ def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
         )
         for name in NAMES
         if config.drives.each[NAMES.index(name)].homing is not None
-    ]
-    plan += [
-        GuideStep(
-            "watchdog",
-            name,
-            f"Watchdog of {named(name)}",
-            f"POWER on drive {name}, then SYNC and heartbeat end: it must switch its power off by itself.",
-            partial(steps.watchdog, name),
-            (("power", name),),
-            (("push", name), ("move", name)),
-        )
-        for name in NAMES
     ]
     moves = [(step.name, step.drive) for step in plan if step.name in ("move", "home")]
     plan.append(

@@ -47,8 +47,12 @@ class KindStep:
         self._robot = geometry(self._config.geometry)
 
     def run(self) -> StepOutcome:
-        """Plan the motion, carry it out, and judge the travel of the mark."""
+        """Plan the motion, carry it out, and judge the travel of the mark.
+
+        Raises DrivesStoppedError if a drive is not homed.
+        """
         bench = self._session.bench()
+        bench.check_homed()
         resolution = self._observer.ask_instrument_resolution()
         try:
             other = other_kind(self._robot)

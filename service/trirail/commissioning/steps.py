@@ -261,7 +261,10 @@ class Steps:
         bench, stopped, deviation = self.session.bench(), "", 0.0
         robot = geometry(self._config.geometry)
         try:
+            bench.check_homed()
             move, path = moves.plan_square(self._config, bench.position)
+        except DrivesStoppedError as error:
+            return Judgement("failed", (str(error),), "then repeat this step"), {}
         except (KinematicsError, ValueError) as error:
             return Judgement("failed", (str(error),), REMEDY), {}
         half = len(path) // 2
