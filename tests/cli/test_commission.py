@@ -13,10 +13,12 @@ from pathlib import Path
 import pytest
 from trirail.cli import commission
 from trirail.cli.app import app
+from trirail.commissioning.bench import Bench
 from trirail.commissioning.person import Question, QuitRequest
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
 from trirail_drivers.errors import BusError, FileError
+from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
 PUSH = ["", "0.01", "0", "10", "0"]
@@ -138,6 +140,38 @@ def test_ctrl_c_ends_it_and_the_report_stays(
     assert [step["step"] for step in (json.loads(report.read_text())["steps"] if report.exists() else [])] == done
     assert bool(done) == report.exists() == report.with_suffix(".txt").exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("number", [signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP], ids=lambda number: number.name)
+def test_a_signal_that_ends_or_suspends_a_process_stops_the_drives_first(
+    number: signal.Signals, robot: str, typed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-\\, Ctrl-Z, and a terminal that is closed, in the step in which drive A has power alone."""
+    os.write(typed, b"\n\ns\ns\ns\n\nq\n")
+    cycle, powered = Bench.cycle, list[Bench]()
+
+    def press(self: Bench, *rates: Triple) -> Feedback:
+        feedback = cycle(self, *rates)
+        if feedback.state[0] is PowerState.OPERATION_ENABLED and not powered:
+            powered.append(self)
+            assert {signal.getsignal(background) for background in (signal.SIGTTIN, signal.SIGTTOU)} == {signal.SIG_IGN}
+            signal.raise_signal(number)
+        return feedback
+
+    def harmless(*_: object) -> None:
+        """Replace the default, which would end this process, or suspend it."""
+
+    monkeypatch.setattr(Bench, "cycle", press)
+    before = signal.signal(number, harmless)
+    try:
+        with pytest.raises(SystemExit, match="130"):
+            run(robot, "--report", "r.json")
+        assert signal.getsignal(number) is harmless
+    finally:
+        signal.signal(number, before)
+    assert powered[0].power_warning == ""
+    last = json.loads((tmp_path / "r.json").read_text())["steps"][-1]
+    assert (last["step"], last["drive"], last["verdict"]) == ("power", "A", "failed")
 
 
 def test_a_command_that_failed_before_its_first_step_can_be_run_again(robot: str, tmp_path: Path) -> None:

@@ -757,6 +757,16 @@ def test_the_report_is_in_its_files_after_every_step(tmp_path: Path, monkeypatch
     assert "remedy: in the configuration drives.C.direction = -1" in words
 
 
+def test_a_step_is_recorded_although_the_terminal_was_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(Beside, "show_judgement", closed)
+    with pytest.raises(OSError, match="Input/output"):
+        Run(tmp_path)
+    assert [entry["step"] for entry in json.loads((tmp_path / "report.json").read_text())["steps"]] == ["bus"]
+
+
 @pytest.mark.generated(0, 1, 2)
 def test_a_report_that_cannot_be_saved_hides_no_judgement(
     seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -47,8 +47,9 @@ def commission(
     The steps are: find the nodes on the bus, set up the drives, move each slider by hand, switch on the power of one
     drive alone, move it 1 mm there and back, test the watchdogs, home, move the platform along a square, and determine
     the kind of mechanism. The command then writes a new configuration with the results. You can refuse and repeat every
-    step. Ctrl-C stops all drives immediately. A report is saved. Answers are lines of standard input, from a person or
-    a script. The exit code is 0 only if no step found an error. Stop the service first.
+    step. Ctrl-C and Ctrl-Z stop all drives immediately and end the command. A report is saved. Answers are lines of
+    standard input, from a person or a script. The exit code is 0 only if no step found an error. Stop the service
+    first.
 
     Parameters
     ----------
@@ -107,9 +108,10 @@ def commission(
 
 @contextlib.contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Record Ctrl-C and SIGTERM instead of exiting, so that the drives are stopped first.
+    """Record the signals that end or suspend a process, so that the drives are stopped first.
 
-    A second signal ends the process.
+    The process is not suspended, since its drives would keep their power. Under nohup, SIGHUP is still ignored.
+    A second Ctrl-C ends the process.
     """
     came = False
 
@@ -119,7 +121,12 @@ def interruption() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         came = True
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, note) for number in numbers}
+    for number in (signal.SIGTTIN, signal.SIGTTOU):
+        before[number] = signal.signal(number, signal.SIG_IGN)
     try:
         yield lambda: came
     finally:

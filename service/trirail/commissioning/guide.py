@@ -325,12 +325,14 @@ class Guide:
     def _record(
         self, step: GuideStep, judgement: Judgement, measured: dict[str, float | int | str | bool | None] | None = None
     ) -> None:
-        judgement = self._steps.session.warn_of_power(judgement)
-        self._operator.show_judgement(judgement)
+        judgement, problem = self._steps.session.warn_of_power(judgement), ""
         try:
             self._report_file.add(step.name, step.drive, judgement, measured or {})
         except FileError as error:
-            self._operator.show(f"  The report is not saved: {error}")
+            problem = f"  The report is not saved: {error}"
+        self._operator.show_judgement(judgement)  # after the report, since the terminal may have been closed
+        if problem:
+            self._operator.show(problem)
 
     def _skip(self, step: GuideStep, reason: str) -> None:
         """Record that a step is skipped, unless it was run before: the result of its last run still counts."""
