@@ -18,6 +18,7 @@ from trirail.processes.loop_process import rehearse
 from trirail_drivers import files
 from trirail_drivers.cia402 import parameter_file
 from trirail_drivers.cia402.backup import RestoreResult, UnrestoredParameter
+from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.parameter_file import ParameterDifference
 from trirail_drivers.cia402.parameters import Parameter, named
 from trirail_drivers.errors import DriveError, FileError
@@ -125,6 +126,30 @@ def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pyte
         run("drives", "restore", str(b))
     with pytest.raises(DriveError, match=r"drive B has node 2 \(the file's 9\)"):
         run("drives", "restore", str(b), "--drive", "B")
+
+
+def test_what_an_eds_lacks_is_told_with_the_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It was cut off between two objects: parameters that it does not describe are not known to be absent."""
+    text = SERVO.read_text(encoding="utf-8")
+    (tmp_path / "cut.eds").write_text(text[: text.index("[6085]")])
+    (tmp_path / "robot.toml").write_text(SIM.read_text().replace("[drives.A]\n", '[drives.A]\neds = "cut.eds"\n'))
+    config = "--config", str(tmp_path / "robot.toml")
+    assert run("drives", "save", str(tmp_path)) == 0
+    whole = tmp_path / "drive-A.dcf"
+    capsys.readouterr()
+    lacking = r"[1-9]\d* objects that it lists but does not describe, such as 6085; is the file complete\?"
+    assert run("drives", "compare", str(whole), *config) == 0
+    words = capsys.readouterr().out
+    assert re.search(lacking, words)
+    assert "not compared: 6085:00" in words
+    assert run("drives", "compare", str(whole), *config, "--json") == 0
+    assert re.search(lacking, json.loads(capsys.readouterr().out)["notes"][0])
+    whole.unlink()
+    assert run("drives", "save", str(tmp_path), *config, "--drive", "A") == 0
+    assert re.search(lacking, capsys.readouterr().out)
+    whole.unlink()
+    assert run("drives", "save", str(tmp_path), *config, "--drive", "A", "--json") == 0
+    assert re.search(lacking, json.loads(capsys.readouterr().out)["drives"]["A"]["notes"][0])
 
 
 def test_a_restore_lists_every_parameter_that_it_leaves(

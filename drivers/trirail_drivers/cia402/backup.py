@@ -207,8 +207,10 @@ async def _save(remote: Remote, drive: Drive, progress: _Progress) -> SavedParam
             else:
                 unread[key] = "it is empty, which no file can hold"
     # The built-in EDS describes only a few objects, and without its manufacturer's EDS a drive may have any others.
-    complete = drive.eds is not None
-    return SavedParameters(drive_origin, read, unread, remote.client.od, complete, frozenset(unanswered))
+    complete = drive.eds is not None and not remote.skipped
+    return SavedParameters(
+        drive_origin, read, unread, remote.client.od, complete, frozenset(unanswered), remote.skipped
+    )
 
 
 async def _repeat(request: Callable[[], Coroutine[Any, Any, T]]) -> T:

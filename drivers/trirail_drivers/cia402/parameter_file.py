@@ -79,10 +79,13 @@ class SavedParameters:
     complete: bool = field(default=True, compare=False)
     """Whether the drive certainly lacks every object that is not listed.
 
-    False for a DCF, which may list only some, and for a drive that was read without its manufacturer's EDS.
+    False for a DCF, which may list only some, and for a drive that was read without its manufacturer's EDS, or with one
+    that cannot be read completely.
     """
     unanswered: frozenset[Key] = field(default=frozenset(), compare=False)
     """Parameters without a value because the drive did not answer."""
+    skipped: str = field(default="", compare=False)
+    """Note for people about the parts of the drive's EDS that could not be read, or ""."""
 
     def knows(self, key: Key) -> bool:
         """Whether the value of an object is known, or the drive is known to lack the object."""

@@ -121,10 +121,10 @@ def save(
             failed[name] = str(error)
             del read[name]
     ok = not failed and not any(saved.unanswered for saved in read.values())
+    built_in = "named from the built-in servo.eds: the manufacturer's own objects need drives.{}.eds"
     notes = {
-        name: f"named from the built-in servo.eds: the manufacturer's own objects need drives.{name}.eds"
-        for name in read
-        if getattr(settings.drives, name).eds is None
+        name: built_in.format(name) if getattr(settings.drives, name).eds is None else saved.skipped
+        for name, saved in read.items()
     }
     if json:
         files = {
@@ -132,7 +132,7 @@ def save(
                 "file": str(paths[name]),
                 "parameters": len(saved.parameters),
                 "unread": {_named(key): why for key, why in saved.unread.items()},
-                "notes": [notes[name]] if name in notes else [],
+                "notes": [notes[name]] if notes[name] else [],
             }
             for name, saved in read.items()
         }
@@ -146,7 +146,7 @@ def save(
             reasons.setdefault(why, []).append(_named(key))
         for why, objects in reasons.items():
             terminal.print_line(f"  {len(objects)} could not be read: {_abbreviate(objects)}: {why}")
-        if name in notes:
+        if notes[name]:
             terminal.print_line(f"  {notes[name]}")
     for words in failed.values():
         terminal.print_error(words)
@@ -207,9 +207,12 @@ def compare(
                 "only_one": [_named(key) for key in only[0]],
                 "only_other": [_named(key) for key in only[1]],
                 "unread": {_named(key): why for key, why in unread.items()},
+                "notes": [two.skipped] if two.skipped else [],
             }
         )
         return 0 if ok else 1
+    if two.skipped:
+        terminal.print_line(two.skipped)
     for field in ("vendor", "product", "revision", "serial"):
         mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
         if mine != theirs:
