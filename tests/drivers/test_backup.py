@@ -21,7 +21,7 @@ from canopen.objectdictionary import ODVariable
 from drivers.foreign import DISABLED, ENABLED, FITTED, QUICK_STOP, ForeignDrive, Habits, Truth, Wires, three
 from drivers.slow import Slowness, three_slow
 from edsfiles import MAKES, Row, eds, make_eds, rows
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace as replacement_refusal
 from rigs import Bus, Clock, alike, frame, ideal_servo
@@ -32,6 +32,8 @@ from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.objects import USES, Key
 from trirail_drivers.cia402.parameter_file import SavedParameters
 from trirail_drivers.cia402.parameters import named, parameter, variables
+from trirail_drivers.cia402.sdo import Remote
+from trirail_drivers.cia402.sdo_client import Client
 from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.protocols import CIA402
@@ -1183,3 +1185,44 @@ def test_a_section_that_looks_like_an_object_is_noted(tmp_path: Path, name: str)
     path = tmp_path / "a.eds"
     path.write_text(SERVO.read_text() + f"\n[{name}]\nParameterName=X\nDataType=7\n")
     assert f"[{name}] in line" in eds_file.load("A", path, 1)[1]
+
+
+SERVO_OBJECTS = eds_file.read(SERVO, 5)
+
+
+class FourBytes(Client):
+    """Client of a drive that answers with four bytes, whose number it tells (43h) or not (42h)."""
+
+    def __init__(self, content: bytes, command: int) -> None:
+        super().__init__(Bus([], Clock(), {}), 5, SERVO_OBJECTS, 0.5, Clock())
+        self._content = bytes([command]), content
+
+    async def _request(self, request: bytes, key: Key | None = None) -> bytes:
+        command, content = self._content
+        return command + request[1:4] + content
+
+
+def value_of(key: Key, content: bytes, command: int = 0x43) -> object:
+    remote = Remote("A", FourBytes(content, command))
+    variable = remote.client.od.get_variable(*key)
+    assert variable is not None
+    with pytest.raises(StopIteration) as end:
+        remote.content(key).send(None)
+    return parameter(variable.data_type, end.value.value, variable.qualname).value
+
+
+@given(value=st.integers(-(2**31), 2**32 - 1))
+@example(90000)
+@example(-40000)
+def test_a_value_that_is_longer_than_its_eds_says_keeps_every_bit(value: int) -> None:
+    """As after an update of a drive's firmware; only padding is cut."""
+    content = (value % 2**32).to_bytes(4, "little")
+    if value >= 0:
+        assert value_of((0x6066, 0), content) == value, "UNSIGNED16"
+    if value < 2**15:
+        assert value_of((0x605A, 0), content) == value, "INTEGER16"
+
+
+@given(value=st.integers(0, 2**16 - 1), rest=st.binary(min_size=2, max_size=2))
+def test_bytes_beyond_a_size_that_was_not_told_are_no_value(value: int, rest: bytes) -> None:
+    assert value_of((0x6066, 0), value.to_bytes(2, "little") + rest, 0x42) == value

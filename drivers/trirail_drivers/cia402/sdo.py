@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 import can
-from canopen.objectdictionary import INTEGER_TYPES
+from canopen.objectdictionary import INTEGER_TYPES, SIGNED_TYPES
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from trirail_drivers.cia402.objects import Key, find_use, signed, width
@@ -198,12 +198,15 @@ class Remote:
     def _own(self, key: Key, data: bytes) -> bytes:
         """Return the bytes of an answer without padding, according to the object's length in the EDS.
 
-        Some drives pad each value to four bytes.
+        Some drives pad each value to four bytes. Other bytes are part of a value that is longer than in the EDS.
         """
         variable = self.client.od.get_variable(*key)
         if len(data) > EXPEDITED or variable is None or not variable.fixed_size:
             return data
-        return data[: len(variable) // 8]
+        own = data[: len(variable) // 8]
+        is_negative = variable.data_type in SIGNED_TYPES and own[-1] & 0x80
+        paddings = (b"\0", b"\xff") if is_negative else (b"\0",)
+        return own if any(data == own.ljust(len(data), padding) for padding in paddings) else data
 
     def _size(self, key: Key) -> int:
         """Return the size of an object that cannot be read [bytes], as described, or according to the drive's EDS or

@@ -95,7 +95,7 @@ class Client:
         """
         answer = await self._request(struct.pack("<BHBI", _UPLOAD << 5, index, subindex, 0))
         if answer[0] & _IS_EXPEDITED:
-            unused = answer[0] >> 2 & 3 if answer[0] & _HAS_SIZE else 0
+            unused = answer[0] >> 2 & 3 if answer[0] & _HAS_SIZE else EXPEDITED - self._described_size(index, subindex)
             return answer[4 : 8 - unused]
         size = int.from_bytes(answer[4:], "little") if answer[0] & _HAS_SIZE else None
         content, toggle = b"", 0
@@ -116,6 +116,11 @@ class Client:
         if size not in (None, len(content)):
             raise SdoCommunicationError(f"{len(content)} bytes received, {size} announced")
         return content
+
+    def _described_size(self, index: int, subindex: int) -> int:
+        """Return the size of a value in an expedited transfer that does not contain the size [bytes]."""
+        variable = self.od.get_variable(index, subindex)
+        return min(EXPEDITED, len(variable) // 8) if variable is not None and variable.fixed_size else EXPEDITED
 
     async def download(self, index: int, subindex: int, data: bytes) -> None:
         """Write an object. Raises the same errors as `upload`."""
