@@ -704,8 +704,9 @@ def test_numbers_are_restored_with_their_units(tmp_path: Path, unit: int, factor
         line.objects.internal(0x60A9, 0).value = factory
         line.objects.internal(0x607F, 0).value = 3_000
         line.objects.internal(0x60A9, 0)._limits = None  # not writable
-        with pytest.raises(DriveError, match=r"60A9.*was not accepted"):
+        with pytest.raises(DriveError, match=r"60A9.*was not accepted.*no other value was written$") as refused:
             line.restore(saved)
+        assert not isinstance(refused.value, backup.RestoreAbortedError), "nothing has changed"
         assert line.objects.internal(0x607F, 0).value == 3_000
 
 
@@ -1082,9 +1083,17 @@ def test_single_lost_frames_end_neither_a_save_nor_a_restore(
         assert [line.objects[0x2100 + number, 0].value for number in range(20)] == list(range(20))
 
 
-@pytest.mark.parametrize("interrupts", [False, True])
+class SignalToEnd(BaseException):
+    """As the command line raises for SIGTERM and for a closed terminal."""
+
+
+@pytest.mark.parametrize(
+    "interruption", [None, KeyboardInterrupt(), SignalToEnd(15)], ids=["lost", "Ctrl-C", "SIGTERM"]
+)
 @pytest.mark.parametrize("answers", [140, 170, 200])
-def test_a_restore_that_ends_early_tells_what_it_has_written(tmp_path: Path, answers: int, interrupts: bool) -> None:
+def test_a_restore_that_ends_early_tells_what_it_has_written(
+    tmp_path: Path, answers: int, interruption: BaseException | None
+) -> None:
     path = tmp_path / "a.eds"
     path.write_text(SERVO.read_text() + listed(20))
     with Line(path) as line:
@@ -1096,8 +1105,8 @@ def test_a_restore_that_ends_early_tells_what_it_has_written(tmp_path: Path, ans
         def end(frame: can.Message) -> can.Message | None:
             if next(left) < answers:
                 return frame
-            if interrupts:
-                raise KeyboardInterrupt
+            if interruption is not None:
+                raise interruption
             return None
 
         line.bus = AlteredBus(line.bus, end)
@@ -1108,7 +1117,7 @@ def test_a_restore_that_ends_early_tells_what_it_has_written(tmp_path: Path, ans
     held = [line.objects[0x2100 + number, 0].value == number for number in range(20)]
     assert 0 <= sum(held) - len(ended.value.written) <= 1
     assert ended.value.intended == 20
-    assert "interrupted" in str(ended.value) or not interrupts
+    assert str(ended.value).startswith("interrupted; ") is (interruption is not None)
 
 
 def test_a_restart_while_parameters_are_read_is_no_restart_of_a_set_up(rig: Foreign) -> None:

@@ -82,8 +82,9 @@ class RestoreAbortedError(DriveError):
     """A restore ended after some parameters had been written: the drive has parameters of both kinds."""
 
     def __init__(self, drive: str, written: tuple[Key, ...], intended: int, cause: BaseException) -> None:
+        reason = str(cause) if isinstance(cause, Exception) else "interrupted"
         super().__init__(
-            f"{str(cause) or 'interrupted'}; drive {drive}: {len(written)} of {intended} parameters were written: "
+            f"{reason}; drive {drive}: {len(written)} of {intended} parameters were written: "
             "restore it again before use"
         )
         self.written = written
@@ -124,7 +125,7 @@ def restore(
     begun = _Progress()
     has_outputs = bool(io[NAMES.index(name)].outputs)
     try:
-        (result,) = _run_conversations(
+        ends = _run_conversations(
             bus,
             drives,
             clock,
@@ -133,14 +134,19 @@ def restore(
             lambda remote, drive: _restore(
                 remote, drive, saved, begun, has_outputs=has_outputs, replace=replace, store=store
             ),
-        ).values()
-        if isinstance(result, DriveError):
-            raise result
-    except (DriveError, KeyboardInterrupt) as error:
+        )
+        return _result_of(ends[name])
+    except BaseException as error:  # also Ctrl-C and other signals: the person must know that the drive has changed
         if not begun.has_begun:
             raise
         raise RestoreAbortedError(name, tuple(begun.written), begun.intended, error) from error
-    return result
+
+
+def _result_of(end: T | DriveError) -> T:
+    """Return the result of a conversation. Raises the error with which it has ended instead."""
+    if isinstance(end, DriveError):
+        raise end
+    return end
 
 
 class _Progress:
@@ -261,6 +267,7 @@ async def _restore(
     units = {key: each for key, each in saved.parameters.items() if key[0] in UNITS}
     _, refused_units = await _write(remote, units, progress)
     for key, why in refused_units.items():
+        progress.has_begun = bool(progress.written)
         raise DriveError(
             f"drive {remote.name}: object {named(key)}, the unit of the file's values, was not accepted: {why}; no "
             "other value was written"
