@@ -11,7 +11,7 @@ from ruckig import InputParameter, Ruckig, Trajectory
 from trirail.commissioning.coupling import MAX_BACKLASH_M
 from trirail.config import Config, SliderLimits, geometry
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.robot import forward, inverse
+from trirail.kinematics.robot import Motion, forward, inverse
 from trirail.motion.ruckig_call import try_solve
 from trirail.quantities import beyond
 
@@ -28,6 +28,9 @@ MAX_ACCELERATION = 0.05
 MAX_JERK = 1.0
 """Jerk limit of all motions [m/s³]."""
 
+GAIN_POINTS = 11
+"""Number of points on each side of the square at which the velocities of the sliders are compared with the platform's.
+"""
 MIN_DISTANCE_M = 1e-9
 """Minimum travel of a motion that Ruckig can plan [m]."""
 
@@ -70,16 +73,17 @@ def choose_distance(position: float | None, limits: tuple[float, float]) -> floa
     return direction * distance
 
 
-def plan_profile(distance: float, limits: SliderLimits, period: float) -> tuple[Array, Array]:
+def plan_profile(distance: float, limits: SliderLimits, period: float, gain: float = 1.0) -> tuple[Array, Array]:
     """Plan a motion from rest to rest over `distance` [m]; return the positions [m] and velocities [m/s], (N,) each.
 
-    The first row is for the first cycle after the start. The limits of this module and the configured `limits` apply.
+    The first row is for the first cycle after the start. The limits of this module and the configured `limits` apply to
+    sliders that move `gain` times as fast.
     """
     request = InputParameter(1)
     request.target_position = [distance]
-    request.max_velocity = [min(MAX_VELOCITY, *limits.velocities)]
-    request.max_acceleration = [min(MAX_ACCELERATION, *limits.accelerations)]
-    request.max_jerk = [min(MAX_JERK, *limits.jerks)]
+    request.max_velocity = [min(MAX_VELOCITY, *limits.velocities) / gain]
+    request.max_acceleration = [min(MAX_ACCELERATION, *limits.accelerations) / gain]
+    request.max_jerk = [min(MAX_JERK, *limits.jerks) / gain]
     trajectory = Trajectory(1)
     if not try_solve(Ruckig(1), request, trajectory):
         raise ValueError(f"Ruckig finds no motion over {distance} m")
@@ -119,15 +123,17 @@ def plan_square(config: Config, sliders: tuple[float, float, float]) -> tuple[Sl
     """
     robot = geometry(config.geometry)
     start = forward(robot, sliders)
-    along, rate = plan_profile(TEST_DISTANCE_M, config.limits.slider, config.period)
-    sides = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)]
-    poses, rates, corner = [], [], np.array(start)
-    for side in np.array(sides):
-        poses.append(corner + along[:, None] * side)
-        rates.append(rate[:, None] * side)
-        corner = corner + TEST_DISTANCE_M * side
-    path = np.concatenate(poses)
-    motion = inverse(robot, path, np.concatenate(rates))
+    sides = np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
+    corners = start + TEST_DISTANCE_M * np.vstack([np.zeros(3), np.cumsum(sides[:-1], axis=0)])
+
+    def motion_along(along: Array, rate: Array) -> tuple[Array, Motion]:
+        path = np.concatenate([corner + along[:, None] * side for corner, side in zip(corners, sides, strict=True)])
+        return path, inverse(robot, path, np.concatenate([rate[:, None] * side for side in sides]))
+
+    points = np.linspace(0.0, TEST_DISTANCE_M, GAIN_POINTS)
+    _, at_unit_speed = motion_along(points, np.ones(GAIN_POINTS))
+    gain = max(1.0, float(np.abs(at_unit_speed.velocity).max()))
+    path, motion = motion_along(*plan_profile(TEST_DISTANCE_M, config.limits.slider, config.period, gain))
     platform, slider = config.limits.platform, config.limits.slider
     for name, unit, values, (low, high) in (
         ("platform x", "m", path[:, 0], platform.x),
