@@ -1056,6 +1056,32 @@ class AlteredBus(can.BusABC):
         self._inner.shutdown()
 
 
+class ExtendedBus(AlteredBus):
+    """Bus on which another device sends frames with 29 bits of identifier before each answer of drive A."""
+
+    def __init__(self, inner: can.BusABC) -> None:
+        super().__init__(inner, lambda answer: answer)
+        self._due: list[can.Message] = []
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if self._due:
+            return self._due.pop(0)
+        answer = super().recv(timeout)
+        if answer is None or answer.arbitration_id != 0x581:
+            return answer
+        abort = bytes([0x80, *answer.data[1:4], *struct.pack("<I", 0x0602_0000)])
+        self._due += [frame(0x581, abort, is_extended_id=True), answer]
+        return frame(0x701, b"\0", is_extended_id=True)
+
+
+def test_frames_with_29_bits_of_identifier_are_neither_answers_nor_boot_up_messages() -> None:
+    with Line(SERVO) as line:
+        saved = line.save()
+        line.bus = ExtendedBus(line.bus)
+        again = line.save()
+    assert (again.parameters, again.unread) == (saved.parameters, saved.unread)
+
+
 def losing(lost: set[int]) -> Callable[[can.Message], can.Message | None]:
     """Lose the answers of these numbers."""
     numbers = itertools.count()

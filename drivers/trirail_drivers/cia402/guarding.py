@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import can
 
-from trirail_drivers.bus.frames import Frame, is_fd
+from trirail_drivers.bus.frames import Frame, can_id, is_fd
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import Key, title
@@ -112,8 +112,7 @@ async def _answers(drive: Differences, node: int) -> bool:
         return False
 
     def is_answer(message: can.Message) -> bool:
-        own = message.arbitration_id == canopen_frames.HEARTBEAT + node
-        return own and not message.is_remote_frame and len(message.data) > 0
+        return can_id(message) == canopen_frames.HEARTBEAT + node and len(message.data) > 0
 
     return await Wait(is_answer, client.clock() + client.timeout) is not None
 

@@ -10,7 +10,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from trirail_drivers.bus import canerrors
-from trirail_drivers.bus.frames import Frame, FrameSender
+from trirail_drivers.bus.frames import Frame, FrameSender, can_id
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.objects import Key
 from trirail_drivers.driver.conversations import Wait
@@ -197,14 +197,12 @@ class Client:
 
         A single second answer may be a late answer, but MAX_SECOND_ANSWERS of them prove that there are two servers.
         """
-        if message.is_error_frame or message.is_remote_frame:
-            return False
         if self._is_boot_up(message):
             return self._asked is not None
-        data = bytes(message.data)
-        if message.arbitration_id == canopen_frames.HEARTBEAT + self.node and data:
+        identifier, data = can_id(message), bytes(message.data)
+        if identifier == canopen_frames.HEARTBEAT + self.node and data:
             self.is_stopped = data[0] & canopen_frames.NMT_STATE_BITS == canopen_frames.STOPPED
-        if message.arbitration_id != canopen_frames.SDO_ANSWER + self.node:
+        if identifier != canopen_frames.SDO_ANSWER + self.node:
             return False
         if self._asked is not None and answers(self._asked, data):
             return True
@@ -212,9 +210,8 @@ class Client:
         return self._asked is not None and self._again >= MAX_SECOND_ANSWERS
 
     def _is_boot_up(self, message: can.Message) -> bool:
-        own = message.arbitration_id == canopen_frames.HEARTBEAT + self.node
-        is_data = not (message.is_error_frame or message.is_remote_frame)
-        return own and is_data and bytes(message.data) == bytes([canopen_frames.BOOT_UP])
+        own = can_id(message) == canopen_frames.HEARTBEAT + self.node
+        return own and bytes(message.data) == bytes([canopen_frames.BOOT_UP])
 
 
 def answers(request: bytes, data: bytes) -> bool:
