@@ -172,6 +172,12 @@ def test_a_restore_lists_every_parameter_that_it_leaves(
     words = capsys.readouterr().out
     assert all(named(each.different.key) in words for each in left)
     assert re.search(r"2000:00 +Node-ID +1 +2 +why 2000", words)
+    for stored in (left, left[-1:]):
+        done = RestoreResult((), stored, True, "")
+        assert run("drives", "restore", str(tmp_path / "drive-A.dcf"), "--store") == 0
+        words = capsys.readouterr().out
+        assert "stored in the drive" in words
+        assert ("with the present values of the set-up" in words) is (len(stored) > 1)
 
 
 def test_the_drives_that_answer_are_saved_and_the_others_named(

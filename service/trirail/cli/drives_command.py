@@ -254,7 +254,8 @@ def restore(
         Accept a drive with another revision, serial number or node id, such as the replacement of a broken drive, and a
         file that does not name its product.
     store
-        Make the drive store the parameters permanently (object 1010h) after all of them have been written.
+        Make the drive store its parameters permanently (object 1010h) after all of them have been written. It stores
+        all present values, also those that the set-up has written since power-on.
     """
     from trirail_drivers.connection.opening import open_bus
 
@@ -275,7 +276,10 @@ def restore(
     terminal.print_line(f"drive {name}: {len(done.written)} parameters written and read back")
     _print_unrestored(str(file), name, done.left)
     if store:
-        terminal.print_line(f"  not stored: {done.not_stored}" if done.not_stored else "  stored in the drive")
+        stored = "stored in the drive"
+        if any(each.by_setup for each in done.left):
+            stored += ", with the present values of the set-up"
+        terminal.print_line(f"  not stored: {done.not_stored}" if done.not_stored else f"  {stored}")
     return 0 if done.ok else 1
 
 
