@@ -1215,6 +1215,21 @@ def test_sections_of_sub_objects_are_found_in_any_spelling(
     assert [key for key, _ in variables(objects)] == [key for key, _ in variables(eds_file.read(SERVO, 1))]
 
 
+@pytest.mark.parametrize("spelt", [str.lower, str.upper])
+def test_keywords_of_an_eds_may_have_letters_of_either_case(tmp_path: Path, spelt: Callable[[str], str]) -> None:
+    """CiA 306: the names of sections and of entries are not case-sensitive."""
+    text = re.sub(r"^\w+(?==)", lambda found: spelt(found[0]), SERVO.read_text(), flags=re.MULTILINE)
+    (tmp_path / "a.eds").write_text(text)
+    objects, note = eds_file.load("A", tmp_path / "a.eds", 1)
+    assert note == ""
+    facts = ("name", "data_type", "access_type", "default", "min", "max", "pdo_mappable")
+
+    def described(of: canopen.ObjectDictionary) -> dict[Key, list[object]]:
+        return {key: [getattr(variable, fact) for fact in facts] for key, variable in variables(of)}
+
+    assert described(objects) == described(eds_file.read(SERVO, 1))
+
+
 @pytest.mark.parametrize("name", ["0x1018sub1", "1018 sub1", "1018sub", "1018.1", "101"])
 def test_a_section_that_looks_like_an_object_is_noted(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.eds"

@@ -25,6 +25,27 @@ _PADDED_DIGIT = re.compile(r"0+([0-7])")
 """Digit from 0 to 7 with leading zeros, which is the same number in decimal and octal."""
 _VERBATIM = ("parametervalue", "defaultvalue")
 """Keys whose digits may be an octet string, in which zeros are significant."""
+_KEYWORDS = {
+    keyword.casefold(): keyword
+    for keyword in (
+        "ParameterName",
+        "ObjectType",
+        "DataType",
+        "AccessType",
+        "PDOMapping",
+        "DefaultValue",
+        "ParameterValue",
+        "LowLimit",
+        "HighLimit",
+        "StorageLocation",
+        "CompactSubObj",
+        "NrOfEntries",
+        "Factor",
+        "Unit",
+        *(f"Dummy{number:04}" for number in range(1, 8)),
+    )
+}
+"""Keys of objects in the spelling that canopen recognises. In CiA 306, they are not case-sensitive."""
 _WITH_SUB_OBJECTS = (8, 9)
 """Object types of arrays and records (CiA 301)."""
 _AFTER = "\x1a\0"
@@ -109,6 +130,7 @@ def _parse_line(values: dict[str, str], line: str) -> str:
     key, equals, value = (part.strip() for part in line.partition("="))
     if not equals:
         return "no value"
+    key = _KEYWORDS.get(key.casefold(), key)
     small = _PADDED_DIGIT.fullmatch(value) if key.casefold() not in _VERBATIM else None
     value = small[1] if small else value
     if values.get(key, value) != value:
