@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import operator
 import os
 import queue
 import signal
@@ -20,14 +21,16 @@ from typing import Any, Self
 import msgspec
 import pytest
 import zenoh
-from trirail.client import blocking
+from trirail.client import async_client, blocking
 from trirail.client.blocking import Jog, Lease, LoopThread
 from trirail.client.client import Robot
 from trirail.client.connection import Connection
-from trirail.errors import ServiceError
+from trirail.errors import RefusalCode, ServiceError, TrirailError
 from trirail.wire import zenoh_session
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import CommandReply, Event, GoalReply
+from trirail.wire.stop_protocol import STOPS
+from trirail.wire.vocabulary import Command, Stop
 from waiting import WITHIN, wait_until
 
 CLOSED = "the connection is closed"
@@ -98,8 +101,12 @@ class Call:
     def _run(self) -> None:
         try:
             self.outcome = self._do()
-        except ServiceError as error:
+        except TrirailError as error:
             self.outcome = error
+
+    def wait_until_called(self) -> None:
+        """Wait until the thread waits for the robot."""
+        wait_until(lambda: waits(self._thread.ident or 0))
 
     def end(self) -> Any:
         self._thread.join(WITHIN)
@@ -107,18 +114,20 @@ class Call:
         return self.outcome
 
 
+def waits(thread: int) -> bool:
+    """Whether a thread waits for the end of a call of the robot."""
+    frame = sys._current_frames()[thread]
+    codes = [frame.f_code for frame, _ in traceback.walk_stack(frame)]
+    return codes[0] is threading.Condition.wait.__code__ and LoopThread.call.__code__ in codes
+
+
 def interrupt(do: Callable[[], object], when: Callable[[], object] = lambda: None) -> None:
     """Press Ctrl-C in a call of the main thread once something has come, and the thread waits."""
     main = threading.get_ident()
 
-    def waits() -> bool:
-        frame = sys._current_frames()[main]
-        codes = [frame.f_code for frame, _ in traceback.walk_stack(frame)]
-        return codes[0] is threading.Condition.wait.__code__ and LoopThread.call.__code__ in codes
-
     def press() -> None:
         when()
-        wait_until(waits)
+        wait_until(lambda: waits(main))
         signal.pthread_kill(main, signal.SIGINT)
 
     pressing = threading.Thread(target=press)
@@ -135,8 +144,9 @@ STOPPING: dict[str, Callable[[Robot], object]] = {
 }
 
 
-@pytest.mark.parametrize("name", STOPPING)
-def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str, robot: Robot, slow: Slow) -> None:
+@contextlib.contextmanager
+def congested(robot: Robot) -> Iterator[threading.Event]:
+    """Hold up the robot's calls, as a link without room does; yield the event that ends this."""
     free, held = threading.Event(), threading.Event()
 
     async def send() -> None:
@@ -145,15 +155,21 @@ def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str, robo
 
     robot._loop.start(send())
     assert held.wait(WITHIN)
-    stopping = Call(lambda: STOPPING[name](robot))
     try:
+        yield free
+    finally:
+        free.set()
+
+
+@pytest.mark.parametrize("name", STOPPING)
+def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str, robot: Robot, slow: Slow) -> None:
+    with congested(robot) as free:
+        stopping = Call(lambda: STOPPING[name](robot))
         query = slow.next()
         assert str(query.key_expr) == f"trirail/demo/cmd/ann/{name}"
         reply(query, CommandReply(name, "holding", 1))
         stopping.end()
         assert not free.is_set()
-    finally:
-        free.set()
 
 
 def test_a_stop_that_a_congested_link_holds_up_delays_no_other_stop(
@@ -179,6 +195,107 @@ def test_a_stop_that_a_congested_link_holds_up_delays_no_other_stop(
         free.set()
     reply(slow.next(), CommandReply("stop", "fault", 2))
     stopping.end()
+
+
+STARTING: dict[str, Callable[[Robot], object]] = {
+    "goal": lambda robot: robot.move_to(0.01, 0.0, 0.0),
+    "path": lambda robot: robot.follow([(0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 0.0, 0.0)]),
+    "jog": lambda robot: held(robot.jog(x=0.01, timeout=0.3)),
+    "track": lambda robot: robot.track().update((0.0, 0.0, 0.0)),
+    **{name: operator.methodcaller("command", name) for name in Command if name.starts},
+}
+
+
+def stop_and_confirm(robot: Robot, slow: Slow, name: str = "stop") -> None:
+    stopping = Call(lambda: robot.command(name))
+    reply(slow.next(), CommandReply(name, "holding", 1))
+    assert stopping.end().mode == "holding"
+
+
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("name", STARTING)
+def test_what_was_called_before_a_stop_is_not_sent_after_it(robot: Robot, slow: Slow, name: str, stop: str) -> None:
+    with congested(robot):
+        starting = Call(lambda: STARTING[name](robot))
+        starting.wait_until_called()
+        stop_and_confirm(robot, slow, stop)
+    refused = starting.end()
+    assert (refused.code, slow.asked.qsize()) == (RefusalCode.STOPPED, 0)
+    robot._loop.start(robot._robot.command("enable"))  # what is called afterwards is sent
+    assert str(slow.next().key_expr).endswith("/enable")
+
+
+@pytest.mark.parametrize("stop", [name for name in Command if name.stops])
+def test_a_path_that_is_read_while_a_stop_is_carried_out_is_not_followed(robot: Robot, slow: Slow, stop: str) -> None:
+    reading, read = threading.Event(), threading.Event()
+
+    def rows() -> Iterator[tuple[float, float, float, float]]:
+        reading.set()
+        assert read.wait(WITHIN)
+        yield from ((0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 0.0, 0.0))
+
+    following = Call(lambda: robot.follow(rows()))
+    assert reading.wait(WITHIN)
+    stop_and_confirm(robot, slow, stop)
+    read.set()
+    assert (following.end().code, slow.asked.qsize()) == (RefusalCode.STOPPED, 0)
+
+
+def test_a_path_does_not_begin_after_a_stop_that_came_when_its_first_point_was_reached(
+    robot: Robot, slow: Slow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arrived, go_on = threading.Event(), threading.Event()
+
+    def check(_: object) -> None:
+        arrived.set()
+        assert go_on.wait(WITHIN)
+
+    monkeypatch.setattr(async_client, "check_arrived", check)
+    following = Call(lambda: robot.follow([(0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 0.0, 0.0)], go_there=True))
+    way = slow.next()
+    assert way.payload is not None
+    goal_id = msgspec.json.decode(way.payload.to_bytes())["id"]
+    reply(way, GoalReply(goal_id, 1.0))
+    ended = Event("goal", "info", "done", id=goal_id, outcome="done", seq=1, t=0.0, cycle=0, time=1.0)
+    slow.session.put("trirail/demo/event", msgspec.json.encode(ended))
+    assert arrived.wait(WITHIN)
+    stop_and_confirm(robot, slow)
+    go_on.set()
+    assert (following.end().code, slow.asked.qsize()) == (RefusalCode.STOPPED, 0)
+
+
+def test_a_goal_that_a_stop_overtakes_on_its_way_is_stopped_when_it_is_accepted(robot: Robot, slow: Slow) -> None:
+    """The stop port is another way than that of the goal."""
+    sending = Call(lambda: robot.move_to(0.01, 0.0, 0.0, id="g"))
+    late = slow.next()
+    stop_and_confirm(robot, slow)
+    reply(late, GoalReply("g", 1.0))
+    assert sending.end().id == "g"
+    with slow.next() as stop:
+        assert stop.payload is not None
+        assert f"{stop.key_expr} {stop.payload.to_string()}" == 'trirail/demo/cmd/ann/stop {"goal":"g"}'
+
+
+@pytest.mark.parametrize("name", ["pause", "the stop of another goal"])
+def test_a_goal_under_way_outlives_what_does_not_stop_it(robot: Robot, slow: Slow, name: str) -> None:
+    with congested(robot):
+        sending = Call(lambda: robot.move_to(0.01, 0.0, 0.0, id="g"))
+        sending.wait_until_called()
+        if name == "pause":
+            halting = Call(robot.pause)
+            halting.wait_until_called()
+        else:
+            halting = Call(lambda: robot.command("stop", Stop("other")))
+            reply(slow.next(), CommandReply("stop", "holding", 1))
+            halting.end()
+    goal = slow.next()
+    if name == "pause":
+        reply(slow.next(), CommandReply("pause", "holding", 1))
+        halting.end()
+    reply(goal, GoalReply("g", 1.0))
+    assert sending.end().id == "g"
+    robot._loop.start(robot._robot.command("enable"))
+    assert str(slow.next().key_expr).endswith("/enable")  # and no stop
 
 
 # ---------------------------------------------------------------------- Ctrl-C

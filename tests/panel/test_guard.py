@@ -18,16 +18,21 @@ from urllib.parse import quote, unquote, urlsplit
 import made
 import msgspec
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
+from trirail.client import trajectory
+from trirail.client.async_client import AsyncRobot
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
 from trirail.panel import feed
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import MAX_MESSAGE, Panel, refused
 from trirail.telemetry.recorder import Recorder
-from trirail.wire.state import Info
+from trirail.wire import zenoh_session
+from trirail.wire.messages import CommandReply, RoleReply
+from trirail.wire.state import Info, NamedPoses
 from trirail.wire.vocabulary import Command
 from waiting import WITHIN, wait_until
 from websockets.exceptions import InvalidStatus
@@ -425,6 +430,65 @@ def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str) -> N
             assert not free.is_set()
         finally:
             free.set()
+
+
+@pytest.fixture
+def asked(tmp_path: Path) -> Iterator[list[str]]:
+    """Goals and commands that reach the robot demo at a socket in `tmp_path`, each of which is confirmed."""
+    found: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        kind, *names = str(query.key_expr).split("/")[2:]
+        if kind in ("goal", "cmd"):
+            found.append("/".join((kind, *names[1:])))
+        fixed = {"info": FakeRobot().info(), "role": RoleReply("ann", "maintainer"), "poses": NamedPoses(())}
+        with query:
+            query.reply(query.key_expr, msgspec.json.encode(fixed.get(kind) or CommandReply(names[-1], "holding", 1)))
+
+    with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/zenoh"]) as session:
+        _declared = session.declare_queryable("trirail/demo/**", zenoh.handlers.Callback(answer, indirect=False))
+        yield found
+
+
+@pytest.mark.parametrize(("request_", "stop"), [("follow", "stop"), ("follow", "pause"), ("enable", "disable")])
+def test_what_was_pressed_before_a_stop_is_not_sent_after_it(
+    request_: str, stop: str, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, free, parse = threading.Event(), threading.Event(), trajectory.parse
+
+    def hold(*arguments: Any) -> Any:
+        held.set()
+        assert free.wait(WITHIN)
+        return parse(*arguments)
+
+    async def send() -> None:
+        held.set()
+        free.wait()  # as Zenoh's own send does, where a link is congested
+
+    monkeypatch.setattr(trajectory, "parse", hold)
+    robot = AsyncRobot("demo", f"unixsock-stream/{tmp_path}/zenoh", "ann")
+    with Panel(robot, 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+
+        def until(said: str) -> str:
+            while said not in (text := str(opened.recv(WITHIN))):
+                pass
+            return text
+
+        if request_ == "follow":
+            path = b"t,x,y,phi\n0,0,0,0\n1,0.01,0,0\n"
+            opened.send(f'{{"do": "upload", "file": 1, "name": "path.csv", "size": {len(path)}}}')
+            opened.send(path)
+            opened.send(f'{{"do": "follow", "file": 1, "seen": {10**15}}}')
+        else:
+            panel._loop.start(send())
+            assert held.wait(WITHIN)
+            opened.send(f'{{"do": "command", "name": "{request_}", "seen": {10**15}}}')
+        assert held.wait(WITHIN)
+        opened.send(f'{{"do": "command", "name": "{stop}"}}')
+        until(f'"done","to":"{stop}"')
+        free.set()
+        assert '"code":"stopped"' in until(f'"refused","to":"{request_}"')
+        assert asked == [f"cmd/{stop}"]
 
 
 REDUCES = {"disable", "stop", "quick_stop", "pause", "release"}

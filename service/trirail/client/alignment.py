@@ -23,6 +23,7 @@ from trirail.alignment.alignment_request import AlignmentRequest, LookReport, Ob
 from trirail.alignment.arguments import check_wait
 from trirail.alignment.camera_calibration import Marks
 from trirail.alignment.results import Measurement
+from trirail.client.call_time import called, called_at
 from trirail.client.goal import Result
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal
@@ -129,6 +130,7 @@ async def drive_async(
 
     """
     check_wait(wait)
+    began = called_at()
     sight = EMPTY_OBSERVATION
     reports = LookReports()
     ids = reports.goal_ids()
@@ -140,7 +142,8 @@ async def drive_async(
             else:
                 if isinstance(request, StageMotion):
                     for goal in goals(request, speed):
-                        await _move(robot, goal, next(ids))
+                        with called(began):  # after a later stop, the procedure must not continue
+                            await _move(robot, goal, next(ids))
                     await completed(sleep(wait))
                     marks = sight.marks
                 else:

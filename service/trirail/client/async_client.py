@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import copy
 import functools
+import math
 import uuid
 from collections.abc import AsyncGenerator, Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, AsyncExitStack, aclosing
@@ -22,6 +23,7 @@ import msgspec
 from trirail_drivers.interface import Triple
 
 from trirail.client.async_connection import AsyncConnection
+from trirail.client.call_time import called, called_at
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import AsyncGoalHandle, AsyncJog, OpenGoals, result_of
 from trirail.client.identity import identity
@@ -35,6 +37,7 @@ from trirail.client.outgoing import (
     made_content,
     number,
     seconds,
+    stops_everything,
 )
 from trirail.client.track import AsyncTrack, Taker
 from trirail.client.trajectory import Points, check_arrived, first_pose, points_of
@@ -309,20 +312,26 @@ class AsyncRobot:
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
         """Send a timed trajectory that begins at the robot's pose; see trirail.client.client.Robot.follow."""
-        trajectory = points_of(points)
-        if go_there:
-            way = await self.send(first_pose(trajectory))
-            try:
-                check_arrived(await way.wait())
-            except asyncio.CancelledError:
-                self._stop_unanswered(way.id)
-                raise
-        return await self.send(
-            lambda name: TrajectoryGoal(
-                trajectory, stretch=stretch, settle=settle, id=name, marks=marks_of(marks), stop_at=stop_at_of(stop_at)
-            ),
-            id,
-        )
+        with called():
+            trajectory = points_of(points)
+            if go_there:
+                way = await self.send(first_pose(trajectory))
+                try:
+                    check_arrived(await way.wait())
+                except asyncio.CancelledError:
+                    self._stop_unanswered(way.id)
+                    raise
+            return await self.send(
+                lambda name: TrajectoryGoal(
+                    trajectory,
+                    stretch=stretch,
+                    settle=settle,
+                    id=name,
+                    marks=marks_of(marks),
+                    stop_at=stop_at_of(stop_at),
+                ),
+                id,
+            )
 
     def jog(
         self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2, tool: Tool | None = None
@@ -362,18 +371,21 @@ class AsyncRobot:
 
         `make` is the goal, or a function that returns the goal for an id.
         """
+        began = called_at()
         goal_id = id or id_of(make)
         *before, last = goal_messages(make, goal_id)
         is_present = functools.partial(self._is_present, goal_id)
         goal = self._goals.open(AsyncGoalHandle(goal_id, self.command, self.role, is_present))
         try:
-            reply = await self._connection.fetch(("goal", self.user), GoalReply, last, before=before)
+            reply = await self._connection.fetch(("goal", self.user), GoalReply, last, before=before, began=began)
         except BaseException as error:
             # If a jog's renewal is cancelled, the jog itself continues until its time-out.
             if self._goals.refuse(goal_id) and isinstance(error, asyncio.CancelledError | ServiceError):
                 self._stop_unanswered(goal_id)
             raise
         self._goals.accept(goal, reply)
+        if self._connection.later_stops(began) & STOPS:  # the stop may have overtaken the goal on its separate way
+            self._stop_unanswered(goal_id)
         return goal
 
     async def _is_present(self, goal_id: str) -> bool:
@@ -588,11 +600,16 @@ class AsyncRobot:
         such an object encoded as JSON. The client also sends the commands that stop the robot to the service's stop
         port, which other connections cannot block.
         """
+        began = called_at()
         payload = content_message(name, content)
+        command = Command(name)
+        if command.stops and stops_everything(command, payload):
+            self._connection.note_stop(command)
         if name in STOPS:
             return await self._connection.stop(self.user, name, payload, REPLY_WITHIN)
-        within = {Command.HOME: HOME_WITHIN, Command.ENABLE: ENABLE_WITHIN}.get(Command(name), REPLY_WITHIN)
-        return await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within)
+        within = {Command.HOME: HOME_WITHIN, Command.ENABLE: ENABLE_WITHIN}.get(command, REPLY_WITHIN)
+        before = began if command.starts else math.inf
+        return await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
 
     async def info(self) -> Info:
         """Return the robot's geometry, limits, rates and versions."""

@@ -18,6 +18,7 @@ from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.wire.messages import CommandReply, Event, RoleReply
 from trirail.wire.state import State
 from trirail.wire.text import is_name
+from trirail.wire.vocabulary import Command
 
 OTHER_LOOP = "the robot belongs to another event loop: enter a robot in this one, as async with AsyncRobot(…)"
 
@@ -63,18 +64,23 @@ class AsyncConnection:
         within: float = REPLY_WITHIN,
         before: Sequence[bytes] = (),
         copy: str | None = None,
+        began: float = math.inf,
     ) -> T:
         """Query the key made of `parts`; return the first valid reply, decoded as a message of `kind`.
 
         `before` are earlier parts of a message that does not fit into one query; the client sends them first and
-        ignores the replies to them. `copy` is the id that the copies of a stop share.
+        ignores the replies to them. `copy` is the id that the copies of a stop share. `began` is the time at which a
+        program called for a request that may start motion [s].
 
-        Raises RefusedError if the service refuses the query, or if no reply arrives because the user's role does not
-        allow the query. Raises ServiceError if no valid reply arrives in time.
+        Raises RefusedError if the service refuses the query, if no reply arrives because the user's role does not allow
+        the query, or if a stop was called after `began` and before the query is sent. Raises ServiceError if no valid
+        reply arrives in time.
         """
         unreadable: ServiceError | None = None
         for part in before:
+            self._connection.check_stops(began)
             self.query_unanswered(parts, part)
+        self._connection.check_stops(began)
         query = self._connection.query(parts, payload, within)
         async with aclosing(self._replies(lambda session: session.get, attachment=copy, **query)) as replies:
             async for reply in replies:
@@ -112,6 +118,14 @@ class AsyncConnection:
             except SilenceError as error:
                 raise await self.nobody("cmd", user, name) from error
         return reply
+
+    def note_stop(self, name: Command) -> None:
+        """Store the time of the present call, which stops the robot."""
+        self._connection.note_stop(name)
+
+    def later_stops(self, began: float) -> set[Command]:
+        """Return the commands that stop the robot and were called later than `began` [s]."""
+        return self._connection.later_stops(began)
 
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]

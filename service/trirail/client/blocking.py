@@ -11,6 +11,7 @@ from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Seque
 from concurrent.futures import CancelledError, Future
 from typing import Any, Generic, Self, TypeVar
 
+from trirail.client.call_time import called, called_at
 from trirail.client.connection import CLOSED, FORKED
 from trirail.client.goal import AsyncGoalHandle, AsyncJog, Result
 from trirail.client.lease import AsyncLease
@@ -55,10 +56,12 @@ class _Call(Generic[T]):
         self._coroutine = coroutine
         self._undo = undo
         self._task: asyncio.Task[T] | None = None
+        self._called_at = called_at()
 
     def start(self) -> None:
         """Start the coroutine. Call this function in the event loop."""
-        self._task = asyncio.get_running_loop().create_task(self._coroutine)
+        with called(self._called_at):
+            self._task = asyncio.get_running_loop().create_task(self._coroutine)
         self._task.add_done_callback(self._set_outcome)
 
     def discard(self) -> None:

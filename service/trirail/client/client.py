@@ -19,6 +19,7 @@ import zenoh
 
 from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import GoalHandle, Jog, Lease, LoopThread, Track, callback
+from trirail.client.call_time import called
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.client.trajectory import Points, points_of
 from trirail.errors import TrirailError
@@ -274,7 +275,6 @@ class Robot:
         `stretch`, the service instead slows the whole trajectory down. With `settle` False, the goal is done when its
         path ends, even if the measured position has not yet reached the target.
         """
-        points = points_of(points)  # in the caller's thread, since the caller's iterator may call this robot
         how: dict[str, Any] = {
             "stretch": stretch,
             "settle": settle,
@@ -282,7 +282,9 @@ class Robot:
             "marks": marks,
             "stop_at": stop_at,
         }
-        return self._send(lambda: self._robot.follow(points, **how, id=id))
+        with called():
+            rows = points_of(points)  # in the caller's thread, since the caller's iterator may call this robot
+            return self._send(lambda: self._robot.follow(rows, **how, id=id))
 
     # ------------------------------------------------------------------ what the service tells
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import threading
 import time
@@ -15,6 +16,7 @@ import msgspec
 import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
+from trirail.client.call_time import called_at
 from trirail.client.samples import SampleReader
 from trirail.client.stop_call import Outcome, Outcomes, StopOrder
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
@@ -25,7 +27,7 @@ from trirail.wire.messages import CommandReply, ErrorReply, Event, RoleReply
 from trirail.wire.starting import is_starting
 from trirail.wire.state import State
 from trirail.wire.text import is_name, quoted
-from trirail.wire.vocabulary import Role
+from trirail.wire.vocabulary import Command, Role
 
 ROLE_WITHIN = 0.8
 """Time-out of the reply with a user's role [s]."""
@@ -79,6 +81,8 @@ class Connection:
         self._process = os.getpid()
         self._reader = SampleReader()
         self._known = 0, 0.0
+        self._stopped_at = {name: -math.inf for name in Command if name.stops}
+        """Time of the newest call of each command that stops the robot, on the monotonic clock [s]."""
         self._here = self._opened.liveliness().declare_token(self.key("here", user)) if user is not None else None
 
     @property
@@ -153,6 +157,21 @@ class Connection:
         finally:
             if at_door is not None:
                 at_door.cancel()
+
+    def note_stop(self, name: Command) -> None:
+        """Store the time of the present call, which stops the robot."""
+        self._stopped_at[name] = max(self._stopped_at[name], called_at())
+
+    def later_stops(self, began: float) -> set[Command]:
+        """Return the commands that stop the robot and were called later than `began` [s]."""
+        return {name for name, at in self._stopped_at.items() if began < at}
+
+    def check_stops(self, began: float) -> None:
+        """Raise RefusedError if a stop was called later than a request that has not been sent yet."""
+        if names := self.later_stops(began):
+            raise RefusedError(
+                RefusalCode.STOPPED, f"not sent: {' and '.join(sorted(names))} was called later and came first"
+            )
 
     def _post_stop(self, query: dict[str, Any], deliver: Callable[[Outcome], None]) -> None:
         try:

@@ -8,6 +8,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable
+from contextvars import Context
 from typing import NamedTuple, Self
 
 import msgspec
@@ -295,7 +296,8 @@ class AsyncJog:
 
     async def __aenter__(self) -> Self:
         self._goal = await self._send(self._velocity, self._timeout)
-        self._renewing = asyncio.create_task(self._renew(), name="jog")
+        # Without the time of this call: after a later stop, the service itself refuses each renewal, with `jog_over`.
+        self._renewing = asyncio.create_task(self._renew(), name="jog", context=Context())
         return self
 
     async def __aexit__(self, *_: object) -> None:

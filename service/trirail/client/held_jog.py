@@ -8,6 +8,7 @@ import uuid
 from collections.abc import Callable
 
 from trirail.client.blocking import GoalHandle
+from trirail.client.call_time import called
 from trirail.client.goal import BRAKE_RENEWAL_S, Velocity
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, Tool, VelocityGoal
@@ -97,7 +98,8 @@ class HeldJog:
             return
         self._tool = tool
         try:
-            self._goal = self._send(velocity, TIMEOUT)
+            with called(at):
+                self._goal = self._send(velocity, TIMEOUT)
         except RefusedError as refusal:
             begun = self._goal is not None and refusal.code in (RefusalCode.JOG_OVER, RefusalCode.DUPLICATE_ID)
             self._end("the jog has ended: release, then press again" if begun else str(refusal), refusal)

@@ -23,7 +23,7 @@ from trirail.wire.kinds.trajectory import parts
 from trirail.wire.plain_values import finite, plain_value
 from trirail.wire.sizes import MAX_POINTS
 from trirail.wire.text import quoted
-from trirail.wire.vocabulary import Command, CommandContent
+from trirail.wire.vocabulary import Command, CommandContent, Stop
 
 
 def message(make: Callable[[], msgspec.Struct], kind: Any, what: str) -> bytes:
@@ -94,6 +94,15 @@ def content_message(name: str, content: CommandContent | bytes | None) -> bytes 
     if content is None or isinstance(content, bytes):
         return content
     return made_content(command, lambda: content)
+
+
+def stops_everything(command: Command, payload: bytes | None) -> bool:
+    """Return False if the content of a command that stops the robot restricts it to a single goal."""
+    try:
+        content = boundary.decode(payload or b"", command.accepts, command)
+    except RefusedError:
+        return True  # the service carries out a stop with any content
+    return not isinstance(content, Stop) or content.goal is None
 
 
 def made_content(command: Command, make: Callable[[], CommandContent]) -> bytes:
