@@ -107,6 +107,23 @@ def test_what_takes_the_page_from_the_operator_lets_go(enabled: Page, robot: Fak
     enabled.let_go()
 
 
+@pytest.mark.usefixtures("slow_hand")
+@pytest.mark.parametrize("by", ["#language", "#along", "key in a list", "contextmenu", "dragstart"])
+def test_what_takes_the_keys_from_the_page_lets_go(enabled: Page, robot: FakeRobot, by: str) -> None:
+    """A page hears no key while a list or menu is open, or while something is dragged."""
+    enabled.key_down("ArrowRight")
+    moves(robot)
+    if by.startswith("#"):
+        enabled.click(by)
+    elif by == "key in a list":
+        enabled.evaluate("document.querySelector('#along').focus()")
+        enabled.key_down("F4")
+    else:
+        enabled.evaluate(f"document.body.dispatchEvent(new Event('{by}', {{bubbles: true, cancelable: true}}))")
+    stands(robot)
+    enabled.key_up("ArrowRight")
+
+
 def test_a_page_that_hangs_moves_nothing_and_begins_nothing_when_it_goes_on(enabled: Page, robot: FakeRobot) -> None:
     enabled.press("[data-axis=x][data-sign='1']")
     moves(robot)

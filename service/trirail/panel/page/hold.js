@@ -28,7 +28,10 @@ export class Hold {
     for (const button of this.buttons) this.#listen(button);
     addEventListener("keydown", (event) => this.#key(event));
     addEventListener("keyup", (event) => this.#up(`key ${event.code}`));
-    for (const gone of ["blur", "pagehide", "freeze"]) addEventListener(gone, () => this.end());
+    for (const gone of ["blur", "pagehide", "freeze", "dragstart"]) addEventListener(gone, () => this.end());
+    // While a list or a menu is open, the browser gives it every key, also the end of one that was held before.
+    addEventListener("pointerdown", (event) => event.target.matches("select") && this.end(), true);
+    addEventListener("contextmenu", (event) => event.defaultPrevented || this.end());
     document.addEventListener("visibilitychange", () => document.hidden && this.end());
   }
 
@@ -59,7 +62,8 @@ export class Hold {
   }
 
   #key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return this.end(); // the key's end may be told to nobody
+    // The key's end may be told to nobody; a key in a list may open it.
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("select")) return this.end();
     const onButton = event.key === "Enter" && this.buttons.includes(event.target);
     const axis = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
     if (!onButton && (!axis || event.target.matches(OWN_KEYS))) return;
