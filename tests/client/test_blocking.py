@@ -25,6 +25,7 @@ from trirail.client import async_client, blocking
 from trirail.client.blocking import Jog, Lease, LoopThread
 from trirail.client.client import Robot
 from trirail.client.connection import Connection
+from trirail.client.new_stop import NewStop
 from trirail.errors import RefusalCode, ServiceError, TrirailError
 from trirail.wire import zenoh_session
 from trirail.wire.goals import Goal, PoseGoal
@@ -195,6 +196,29 @@ def test_a_stop_that_a_congested_link_holds_up_delays_no_other_stop(
         free.set()
     reply(slow.next(), CommandReply("stop", "fault", 2))
     stopping.end()
+
+
+@pytest.mark.parametrize("name", STOPPING)
+def test_a_stop_is_sent_where_no_thread_can_be_started(
+    name: str, robot: Robot, answered: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    STOPPING[name](robot)
+    assert answered == [f"trirail/demo/cmd/ann/{name} "]
+
+
+def test_a_stop_without_a_session_is_sent_where_no_thread_can_be_started(
+    answered: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    NewStop("stop", "demo", f"unixsock-stream/{tmp_path}/zenoh").wait()
+    assert [asked.rpartition("/")[2] for asked in answered] == ["stop "]
 
 
 STARTING: dict[str, Callable[[Robot], object]] = {

@@ -432,6 +432,19 @@ def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str) -> N
             free.set()
 
 
+def test_a_stop_that_fails_in_an_unexpected_way_is_answered_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = FakeRobot()
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(robot, "command", fail)
+    with Panel(robot.robot(), 0) as panel:
+        (refused,) = replies(panel, robot, [], 0)
+        assert (refused["tell"], refused["to"]) == ("refused", "stop")
+        assert "can't start new thread" in refused["message"]
+
+
 @pytest.fixture
 def asked(tmp_path: Path) -> Iterator[list[str]]:
     """Goals and commands that reach the robot demo at a socket in `tmp_path`, each of which is confirmed."""

@@ -151,7 +151,7 @@ class Connection:
             query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
             try:
                 threading.Thread(target=self._post_stop, args=(query, deliver), name="zenoh stop", daemon=True).start()
-            except RuntimeError:  # while the interpreter ends, it starts no thread
+            except RuntimeError:  # no thread can be started, as in StopOrder.at_door
                 self._post_stop(query, deliver)
             yield Outcomes(2 if at_door is not None else 1)
         finally:

@@ -33,7 +33,10 @@ class NewStop:
         self._confirmed = False
         self.opening = threading.Thread(target=self._query, args=(stop, connect, credentials), daemon=True)
         """Thread that opens the session and sends the stop; Zenoh cannot cancel the opening of a session."""
-        self.opening.start()
+        try:
+            self.opening.start()
+        except RuntimeError:  # no thread can be started, as in StopOrder.at_door
+            self._query(stop, connect, credentials)
 
     def wait(self) -> CommandReply:
         """Return the first reply. Raises RefusedError if the service refuses, ServiceError if there is no reply."""

@@ -63,14 +63,18 @@ class StopOrder(NamedTuple):
     ) -> StopCall | None:
         """Send the stop to the stop port that belongs to a locator, and pass the outcome to `deliver`.
 
-        Return None, without sending, if the locator has no stop port or the message is too long for the port.
+        Return None, without sending, if the locator has no stop port, the message is too long for the port, or the
+        process can start no thread. The stop must then be sent over Zenoh only.
         """
         address = stop_address(locator)
         content = (self.content or b"").decode(errors="replace")
         line = encode(StopRequest(zenoh_session.key(self.robot, *self.parts), self.id, content))
         if address is None or len(line) > MAX_LINE:
             return None
-        return StopCall(address, credentials, line, self.within, deliver)
+        try:
+            return StopCall(address, credentials, line, self.within, deliver)
+        except RuntimeError:  # no memory or process is left for a thread, or the interpreter ends
+            return None
 
 
 class Outcomes:

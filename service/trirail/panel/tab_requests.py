@@ -132,6 +132,9 @@ class TabRequests:
             done = await send_request()
         except TrirailError as error:
             self._reply("refused", to=kind, name=name, **refusal(error))
+        except Exception as error:
+            self._reply("refused", to=kind, name=name, message=repr(error))
+            raise  # to the log
         else:
             if isinstance(done, AsyncGoalHandle):
                 self._reply("accepted", to=kind, name=name, id=done.id)
