@@ -92,6 +92,8 @@ class FakeRobot:
         self.refusal: RefusedError | None = None
         self.silent = threading.Event()
         self.told = msgspec.structs.replace(info(load(SIM)), homes=homes)
+        self.began = 0.0
+        """Time at which the service started, on this machine's monotonic clock [s]."""
         self._hanging: dict[str, threading.Event] = {}
         self._handles: dict[str, AsyncGoalHandle] = {}
         self._ended: set[str] = set()
@@ -284,7 +286,7 @@ class FakeRobot:
         return State(
             seq=seq,
             t=seq / 1e3,
-            time=1.7e9 + seq / 1e3,
+            time=1.7e9 + self.began + seq / 1e3,
             mode=self.mode,
             pose=Pose(x, y, phi),
             velocity=self.velocity,
@@ -303,7 +305,7 @@ class FakeRobot:
         )
 
     def _seq(self) -> int:
-        return int(time.monotonic() * 1000)
+        return int((time.monotonic() - self.began) * 1000)
 
     def _advance(self) -> None:
         """Move on to now; stand where a jog was not renewed in time."""

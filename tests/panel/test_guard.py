@@ -179,6 +179,18 @@ def test_the_recordings_are_those_of_the_service_that_runs_now(tmp_path: Path) -
     assert listed == {"folder": str(tmp_path), "here": False, "sessions": [], "trouble": ""}
 
 
+@pytest.mark.parametrize("later", [1.0, -1.0])
+def test_a_service_that_starts_again_without_a_silence_is_described_again(later: float) -> None:
+    """As where states are rare, or the panel was suspended meanwhile: the new service may have run for longer."""
+    robot = FakeRobot()
+    with Panel(robot.robot(), 0) as panel:
+        hear(panel)
+        robot.told = msgspec.structs.replace(robot.told, version="99.9")
+        robot.began += later
+        with panel._feed.changed:
+            assert panel._feed.changed.wait_for(lambda: b'"version":"99.9"' in panel._feed.messages["robot"], WITHIN)
+
+
 def test_a_service_that_is_asked_before_it_can_answer_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that has just started publishes states, but its first answer may be late or lost."""
     robot, asked = FakeRobot(), threading.Event()

@@ -29,6 +29,10 @@ from trirail.wire.vocabulary import Role
 
 SILENCE_S = 1.0
 """Minimum time without a state after which the service counts as silent [s]."""
+RESTART_S = 0.5
+"""Minimum change of the service's start time that shows a restart [s].
+
+A restart takes longer, and the start time also changes by the ticks that the loop misses between two states."""
 MAX_STATE_AGE_S = 0.5
 """Minimum of the limit of the age of the newest state on the page at which the page can move the robot [s].
 
@@ -107,10 +111,14 @@ class Feed:
 
     async def _receive_states(self) -> None:
         is_new = False
+        started: float | None = None
         while True:
             async with aclosing(self._robot.states(self._info.state_timeout(SILENCE_S))) as states:
                 async for state in states:
-                    if is_new:  # a service that was silent may have restarted
+                    # A service that was silent may have restarted. If this process was suspended meanwhile, or states
+                    # are rare, only the start time shows the restart.
+                    last, started = started, state.time - state.t
+                    if is_new or (last is not None and abs(started - last) > RESTART_S):
                         await self._describe()
                         is_new = False
                     if self.trouble:  # the page would use the limits and the drawing of another robot
