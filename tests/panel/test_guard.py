@@ -424,6 +424,37 @@ def test_the_last_override_counts_however_slow_the_answers_are() -> None:
         assert robot.commands == ["override", "pause", "override"]
 
 
+def test_override_0_waits_for_no_other_override() -> None:
+    robot = FakeRobot()
+    with Panel(robot.robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+
+        def override(percent: int) -> None:
+            content = f'"content": {{"percent": {percent}}}, "seen": {10**15}'
+            opened.send(f'{{"do": "command", "name": "override", {content}}}')
+
+        with robot.hanging("override"):
+            for percent in (50, 40, 0):
+                override(percent)
+            wait_until(lambda: robot.commands == ["override", "override"])  # 50 and 0
+            override(30)
+        while '"override":0.3' not in str(opened.recv(WITHIN)):
+            pass
+        assert len(robot.commands) == 3
+
+
+@pytest.mark.parametrize("request_", [{"name": "override", "content": {"percent": 0.0}}, {"name": "release"}])
+def test_what_reduces_motion_is_sent_however_many_requests_are_not_answered(request_: dict[str, Any]) -> None:
+    robot = FakeRobot()
+    goal = {"do": "goal", "goal": {"kind": "named", "name": "park"}, "seen": 10**15}
+    with robot.hanging("goal"), Panel(robot.robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+        for message in [*[goal] * 9, {"do": "command"} | request_]:
+            opened.send(msgspec.json.encode(message).decode())
+        said = ""
+        while f'"to":"{request_["name"]}"' not in said:
+            said = str(opened.recv(WITHIN))
+        assert '"tell":"done"' in said
+
+
 @pytest.mark.parametrize("name", ["stop", "quick_stop", "disable"])
 def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str) -> None:
     free, held = threading.Event(), threading.Event()

@@ -25,7 +25,7 @@ from trirail.wire.vocabulary import Command
 MAX_PENDING = 8
 """Maximum number of unanswered requests of a tab.
 
-Commands that stop the robot do not count, and have a separate limit of the same size.
+Commands that only reduce motion do not count; each of them has a separate limit of the same size.
 """
 
 
@@ -84,16 +84,16 @@ class TabRequests:
 
         Ignore a command that is already pending. If the page's state is outdated, refuse every request except commands
         that only reduce motion. Of the overrides that are requested while another override is pending, only the newest
-        is sent.
+        is sent, except that the override 0 is sent immediately.
         """
         kind, name, send = self._prepared(request)
         reduces = isinstance(request, SendCommand) and request.only_reduces_motion
         if not reduces and not self._feed.is_fresh(request.seen):
             self._reply("refused", to=kind, name=name, **OUTDATED)
         elif kind == Command.OVERRIDE:
-            self._loop.start(self._set_override(send))
+            self._loop.start(self._set_override(send, reduces=reduces))
         else:
-            (self._stop_loop if kind in STOPS else self._loop).start(self._answer(send, kind, name))
+            (self._stop_loop if kind in STOPS else self._loop).start(self._answer(send, kind, name, reduces=reduces))
 
     def _prepared(self, request: ServiceRequest) -> tuple[str, str, Callable[[], Awaitable[object]]]:
         """Return the fields `to` and `name` of the result of a request, and the function that sends the request."""
@@ -112,17 +112,20 @@ class TabRequests:
             case Forget(name):
                 return "forget", name, lambda: self._robot.forget(name)
 
-    async def _answer(self, send_request: Callable[[], Awaitable[object]], kind: str, name: str = "") -> None:
+    async def _answer(
+        self, send_request: Callable[[], Awaitable[object]], kind: str, name: str = "", *, reduces: bool = False
+    ) -> None:
         """Send a request, and send its result to the page.
 
-        `kind` and `name` become the fields `to` and `name` of the result.
+        `kind` and `name` become the fields `to` and `name` of the result. `reduces` is whether the request only reduces
+        motion.
         """
-        stops = isinstance(kind, Command) and kind.stops
-        # Two commands set_output may concern different outputs.
-        repeats = isinstance(kind, Command) and not stops and kind is not Command.SET_OUTPUT
+        # Two commands set_output may concern different outputs, and `_set_override` sends two overrides deliberately.
+        may_repeat = (Command.SET_OUTPUT, Command.OVERRIDE)
+        repeats = isinstance(kind, Command) and not kind.stops and kind not in may_repeat
         if repeats and self._pending[kind]:
             return
-        place = kind if stops else "others"  # one kind of stop must not keep out another
+        place = f"{kind} to reduce" if reduces else "others"  # one kind of stop must not keep out another
         if self._pending[place] >= MAX_PENDING:
             message = f"{MAX_PENDING} commands of this page are already waiting for replies"
             self._reply("refused", to=kind, name=name, message=message, code=RefusalCode.BUSY)
@@ -144,9 +147,11 @@ class TabRequests:
         finally:
             self._pending.subtract({place, kind})
 
-    async def _set_override(self, send: Callable[[], Awaitable[object]]) -> None:
+    async def _set_override(self, send: Callable[[], Awaitable[object]], *, reduces: bool) -> None:
         """Set the override. The operator's slider sends one for each key press."""
-        self._overrides = [send]
+        self._overrides = [] if reduces else [send]
+        if reduces:
+            await self._answer(send, Command.OVERRIDE, reduces=True)
         while self._overrides and not self._pending[Command.OVERRIDE]:
             await self._answer(self._overrides.pop(), Command.OVERRIDE)
 
