@@ -5,21 +5,28 @@ VENV := .venv
 INSTALLED := $(VENV)/.installed
 READY := $(VENV)/.ready
 
-.PHONY: demo check test test-all test-part test-side-by-side test-alone hil hil-ready explore chaos soak ci-packages bench screenshots clean
+.PHONY: demo check lint types test quick-tests test-all test-part test-side-by-side test-alone hil hil-ready explore chaos soak ci-packages bench screenshots clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
 
-check: $(READY)  ## lint, format, types and import contracts alone
+check: lint types  ## lint, format, types and import contracts alone
+
+lint: $(READY)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
-	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
-test test-part test-side-by-side test-alone: export PYTHONHASHSEED = 0
+types: $(READY)
+	$(VENV)/bin/mypy
+
+quick-tests test-part test-side-by-side test-alone: export PYTHONHASHSEED = 0
 # Where this is set, as in many containers, every worker and every program of a test would compile all modules anew.
-test test-part test-side-by-side test-alone: export PYTHONDONTWRITEBYTECODE =
-test: check  ## before each commit, five minutes: lint, format, types, import contracts, tests of every room, whole services
+quick-tests test-part test-side-by-side test-alone: export PYTHONDONTWRITEBYTECODE =
+test: lint  ## before each commit, five minutes: lint, format, types, import contracts, tests of every room, whole services
+	$(MAKE) --no-print-directory --jobs=2 types quick-tests  # the types of the first run take a minute of one processor
+
+quick-tests: $(READY)
 	$(VENV)/bin/pytest --numprocesses auto --dist worksteal --effort 0.1 -m "core or not (slow or viewer or long or alone)"
 
 test-all: test-side-by-side test-alone  ## the same with every test and every example
