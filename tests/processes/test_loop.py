@@ -465,6 +465,27 @@ def test_a_restarted_gateway_gets_all_events_in_order_few_in_a_cycle(before: int
     shell.rig.bus.shutdown()
 
 
+def test_a_recorder_that_has_read_nothing_for_a_while_gets_every_event_and_the_newest_status(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its disk may be slow. Without the event of the fault, there would be no black box."""
+    monkeypatch.setattr(links, "_BUFFER", 212_992)  # as large as a usual kernel allows
+    shell.enabled()
+    while not shell.ports.recorder.dropped:
+        shell.cycles(20)
+        shell.received()
+    shell.loop.control.modes.trip(coded("drive B: silent", EventCode.OTHER), FaultCause.QUICK_STOP)
+    shell.cycles(20)
+    told: list[Answer] = []
+    for _ in range(20):
+        told += shell.said(shell.recorder)
+        shell.cycles(20)
+    events = [answer.event for answer in told if isinstance(answer, EventReport)]
+    assert [event.seq for event in events] == list(range(1, len(events) + 1))
+    assert [event.message for event in events if event.kind == "fault"] == ["drive B: silent"]
+    assert [answer.fault for answer in told if isinstance(answer, Status)][-1] == "drive B: silent"
+
+
 def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     shell.enabled()
     notice = message(Announcement(Notice("service", "warning", "the disk is full")))

@@ -37,7 +37,7 @@ from trirail.wire.vocabulary import MODES
 
 BATCHES_PER_SECOND = 50
 SENT_TOGETHER = 8
-"""Maximum number of events, and also of answers, that one call sends to the gateway. More would delay the cycle.
+"""Maximum number of events, and also of answers, that one call sends to a peer. More would delay the cycle.
 
 A restarted gateway is sent up to EVENTS_KEPT events.
 """
@@ -49,13 +49,18 @@ INPUTS_KEPT = 8
 They normally wait, because the recorder does not need them earlier.
 """
 EVENTS_KEPT = 1000
-"""Number of events stored for a restarted gateway, because the previous gateway may not have published all of them."""
+"""Number of events stored.
+
+A restarted gateway needs them, because the previous gateway may not have published all of them. A recorder needs them
+if it reads nothing for a while, for example because its disk is slow.
+"""
 
 
 class Reports:
     """Sender of the loop's records in batches, events, answers, and status, which contains what is not in the records.
 
-    No method waits. Events and answers for a slow gateway are stored, and packets for a slow recorder are lost.
+    No method waits. Events and the newest status are stored for a slow gateway and a slow recorder, and answers for a
+    slow gateway. Records and inputs for a slow recorder are lost.
     """
 
     def __init__(
@@ -76,8 +81,8 @@ class Reports:
         self._period = config.period
         self._welcome = Welcome(lacking, drives.bus_load, drives.missing_protections)
         self._status = Status(None, 1.0, None)
-        self._unsent: dict[type, Status | Welcome] = {}
-        """Newest status and welcome for which the gateway had no space, to be sent with the next batch."""
+        self._unsent: dict[tuple[Port, type], Status | Welcome] = {}
+        """Newest status and welcome for which a peer had no space, to be sent with the next batch."""
         self._bus_load = 0.0
         self._traffic = drives.traffic
         self._bus_measured_at = self._progress_at = 0
@@ -85,7 +90,7 @@ class Reports:
         self._events = 0
         self._kept: deque[bytes] = deque(maxlen=EVENTS_KEPT)
         self._answers: deque[bytes] = deque()
-        self._sent_events = 0
+        self._sent_events = dict.fromkeys((gateway, recorder), 0)
         self._inputs = 0
         self._unsent_inputs: list[ControlInput] = []
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
@@ -132,8 +137,8 @@ class Reports:
 
     @property
     def idle(self) -> bool:
-        """True if all events and answers have been sent."""
-        return not (self._answers or self._sent_events < self._events)
+        """True if all events and answers have been sent to the gateway."""
+        return not (self._answers or self._sent_events[self._gateway] < self._events)
 
     @property
     def batch(self) -> NDArray[np.uint8]:
@@ -160,7 +165,8 @@ class Reports:
         """
         if self._control.ledger.answers or self._control.ledger.notices or len(self._unsent_inputs) > INPUTS_KEPT:
             self._publish()
-        self._send_events(at_most)
+        for port in self._sent_events:
+            self._send_events(port, at_most)
         if self._answers:
             self._send_answers(at_most)
 
@@ -179,8 +185,8 @@ class Reports:
         self._measure_bus_load()
         if self._control.measured.feedback.unready != self._unready:
             self._report_progress()
-        for unsent in tuple(self._unsent.values()):
-            self._send_state(unsent)
+        for (port, _), unsent in tuple(self._unsent.items()):
+            self._send_state(port, unsent)
         self.accept_peers()
 
     def accept_peers(self) -> None:
@@ -190,14 +196,14 @@ class Reports:
                 port.send(message(msgspec.structs.replace(self._welcome, newest_event=self._events)))
                 port.send(message(self._status))
                 if port is self._gateway:
-                    self._sent_events = 0
+                    self._sent_events[port] = 0
 
     def report_protections(self) -> None:
         """Report to the gateway which protections the drives lack, if these have changed."""
         missing = self._drives.missing_protections
         if missing != self._welcome.missing_protections:
             self._welcome = msgspec.structs.replace(self._welcome, missing_protections=missing)
-            self._send_state(self._welcome)
+            self._send_state(self._gateway, self._welcome)
 
     def _report_progress(self) -> None:
         """Send the status with the progress of the drives' configuration, at most every PROGRESS_EVERY."""
@@ -249,9 +255,7 @@ class Reports:
         for notice in ledger.notices:
             self._events += 1
             wall, offset = time.time(), time.time() - time.monotonic()
-            packet = event_packet(notice.event(self._events, cycle * self._period, cycle, wall, offset))
-            self._kept.append(packet)
-            self._recorder.send(packet)
+            self._kept.append(event_packet(notice.event(self._events, cycle * self._period, cycle, wall, offset)))
         ledger.notices.clear()
         self._publish_status()
         self._answers.extend(map(message, ledger.answers))
@@ -272,14 +276,14 @@ class Reports:
         status = Status(*fields, self._unrecorded, tuple(map(quoted, control.measured.unready)))
         if status != self._status:
             self._status = status
-            self._send_state(status)
-            self._recorder.send(message(status))
+            for port in (self._gateway, self._recorder):
+                self._send_state(port, status)
 
-    def _send_state(self, state: Status | Welcome) -> None:
-        """Send a state to the gateway. If there is no space, keep it, because a newer state may never follow."""
-        self._unsent.pop(type(state), None)
-        if not self._gateway.send(message(state)) and self._gateway.connected:
-            self._unsent[type(state)] = state
+    def _send_state(self, port: Port, state: Status | Welcome) -> None:
+        """Send a state to a peer. If there is no space, keep it, because a newer state may never follow."""
+        self._unsent.pop((port, type(state)), None)
+        if not port.send(message(state)) and port.connected:
+            self._unsent[port, type(state)] = state
 
     def _send_answers(self, at_most: int) -> None:
         """Send at most `at_most` answers. Answers wait for a slow gateway; if the gateway is lost, drop them."""
@@ -290,10 +294,10 @@ class Reports:
                 return
             self._answers.popleft()
 
-    def _send_events(self, at_most: int) -> None:
-        """Send to the gateway at most `at_most` of the stored events that have not been sent to it."""
-        self._sent_events = max(self._sent_events, self._events - len(self._kept))
-        for _ in range(min(self._events - self._sent_events, at_most)):
-            if not self._gateway.send(self._kept[self._sent_events - self._events]):
-                return
-            self._sent_events += 1
+    def _send_events(self, port: Port, at_most: int) -> None:
+        """Send to a peer at most `at_most` of the stored events that have not been sent to it."""
+        sent = max(self._sent_events[port], self._events - len(self._kept))
+        last = min(self._events, sent + at_most)
+        while sent < last and port.send(self._kept[sent - self._events]):
+            sent += 1
+        self._sent_events[port] = sent
