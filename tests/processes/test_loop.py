@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
+import can
 import msgspec
 import pytest
 from conftest import Followers, Rig, alone, what_memory_takes
@@ -56,6 +57,9 @@ from trirail.wire.plan_packets import NotPlanned, PreemptingMotion, decode_plan_
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override
+from trirail_drivers.bus.can_frame import CAPTURED
+from trirail_drivers.bus.capture import Capture
+from trirail_drivers.bus.frames import packed
 from trirail_drivers.interface import DriveGroup, MissingProtection
 
 NESTED = b"\x91" * 5000
@@ -484,6 +488,25 @@ def test_a_recorder_that_has_read_nothing_for_a_while_gets_every_event_and_the_n
     assert [event.seq for event in events] == list(range(1, len(events) + 1))
     assert [event.message for event in events if event.kind == "fault"] == ["drive B: silent"]
     assert [answer.fault for answer in told if isinstance(answer, Status)][-1] == "drive B: silent"
+
+
+def test_captured_frames_wait_for_a_recorder_that_has_read_nothing_for_a_while(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(links, "_BUFFER", 212_992)  # as large as a usual kernel allows
+    shell.loop._reports._capture = capture = Capture()
+    shell.enabled()
+    count, told = 0, list[float]()
+    while not shell.ports.recorder.dropped:
+        capture.note(packed(can.Message(arbitration_id=0x181, data=bytes(8))), float(count))
+        count += 1
+        shell.cycles(20)
+        shell.received()
+    for _ in range(20):
+        packets = shell.received(shell.recorder)
+        told += [t for each in packets if each[0] == Kind.FRAMES for t, _ in CAPTURED.iter_unpack(each[1:])]
+        shell.cycles(20)
+    assert told == list(range(count))
 
 
 def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:

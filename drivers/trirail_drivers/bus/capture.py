@@ -18,7 +18,7 @@ MAX_FRAMES = 100_000
 
 
 class Capture:
-    """Buffer of the frames captured since the buffer was last drained."""
+    """Buffer of the captured frames that have not been drained."""
 
     def __init__(self) -> None:
         self._frames = bytearray()
@@ -29,10 +29,11 @@ class Capture:
             self._frames += CAPTURED.pack(t, frame)
 
     def drain(self) -> Iterator[bytes]:
-        """Empty the buffer, and yield its frames in chunks of at most CHUNK_FRAMES."""
-        frames, self._frames = self._frames, bytearray()
-        for start in range(0, len(frames), CHUNK_FRAMES * CAPTURED.size):
-            yield bytes(frames[start : start + CHUNK_FRAMES * CAPTURED.size])
+        """Yield the frames in chunks of at most CHUNK_FRAMES. Each is removed when the next is requested."""
+        size = CHUNK_FRAMES * CAPTURED.size
+        while self._frames:
+            yield bytes(self._frames[:size])
+            del self._frames[:size]
 
 
 class CapturedBus(can.BusABC):

@@ -59,8 +59,8 @@ if it reads nothing for a while, for example because its disk is slow.
 class Reports:
     """Sender of the loop's records in batches, events, answers, and status, which contains what is not in the records.
 
-    No method waits. Events and the newest status are stored for a slow gateway and a slow recorder, and answers for a
-    slow gateway. Records and inputs for a slow recorder are lost.
+    No method waits. Events and the newest status are stored for a slow gateway and a slow recorder, answers for a slow
+    gateway, and captured frames for a slow recorder. Records and inputs for a slow recorder are lost.
     """
 
     def __init__(
@@ -181,7 +181,8 @@ class Reports:
             self._unsent_batch = None
         if self._capture is not None and self._recorder.connected:
             for frames in self._capture.drain():
-                self._recorder.send(bytes((Kind.FRAMES,)) + frames)
+                if not self._recorder.send(bytes((Kind.FRAMES,)) + frames):
+                    break
         self._measure_bus_load()
         if self._control.measured.feedback.unready != self._unready:
             self._report_progress()
