@@ -155,6 +155,32 @@ def test_sliders_are_drawn_without_the_backlash_compensation(scene: Scene) -> No
         )
 
 
+def test_a_position_that_is_not_known_is_not_drawn(scene: Scene) -> None:
+    records = made.records(0.2)
+    records["homed"][:100, 1] = 0
+    drawn = by_entity(scene.drawn(records, ReadoutState()))
+
+    def shown(path: str, component: str) -> NDArray[Any]:
+        known: NDArray[np.bool_] = np.isfinite(values(drawn[path], component))
+        return known
+
+    position = shown("/sliders/position", "Scalars:scalars")[:, :3]
+    assert position[:10].tolist() == [[True, False, True]] * 10
+    assert position[10:].all()
+    assert shown("/robot/sliders", "Points2D:positions")[:10, :3, 0].tolist() == [[True, False, True]] * 10
+    for path, component in (
+        ("/pose/centre", "Scalars:scalars"),
+        ("/pose/phi", "Scalars:scalars"),
+        ("/pose/singularity", "Scalars:scalars"),
+        ("/robot/platform", "Transform3D:translation"),
+        ("/robot/commanded", "Transform3D:translation"),
+        ("/robot/trace", "LineStrips2D:strips"),
+    ):
+        first = shown(path, component).reshape(20, -1)[:, 0]
+        assert first.tolist() == [False] * 10 + [True] * 10, path
+    assert shown("/robot/platform", "Transform3D:quaternion").all()  # an invalid one would place it at the origin
+
+
 def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
     records = made.records(0.5)
     records["following_error"][123] = [-2e-3, 1e-3, 0.0]

@@ -85,7 +85,8 @@ def values(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the values of the curves of each plot, (N, curves), for N groups of records that begin at `starts`.
 
-    `newest` contains the last record of each group, and `distance` the distance of its pose to a singularity [rad].
+    `newest` contains the last record of each group, with NaN as positions and poses that are unknown, and `distance`
+    the distance of its pose to a singularity [rad].
     """
     error = records["following_error"]
     highest, lowest = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
@@ -97,7 +98,7 @@ def values(
         ERROR: np.where(highest > -lowest, highest, lowest) * 1e6,  # [µm]
         CENTRE: newest["pose"][:, :2] * 1e3,  # [mm]
         PHI: np.degrees(newest["pose"][:, 2:]),  # [°]
-        SINGULARITY: np.degrees(distance)[:, np.newaxis],  # [°]
+        SINGULARITY: np.degrees(np.where(np.isnan(newest["pose"][:, 2]), np.nan, distance))[:, np.newaxis],  # [°]
         TIMING: np.maximum.reduceat(times, starts) * 1e-3,  # [µs]
     }
 
@@ -108,7 +109,7 @@ def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64
     limits = np.array([limit.value for limit in lines.still])
     table = np.empty((rows, count + len(limits)))
     table[:, :count] = moving
-    highest = np.where(limits > 0.0, moving.max(initial=0.0), -moving.min(initial=0.0))
+    highest = np.where(limits > 0.0, np.nanmax(moving, initial=0.0), -np.nanmin(moving, initial=0.0))
     table[:, count:] = np.where(highest >= lines.drawn_from * np.abs(limits), limits, np.nan)
     return table
 

@@ -139,10 +139,11 @@ def _labelled(
 
 
 def _placed(path: str, pose: Points) -> list[Column]:
-    """Return the transforms from the platform's frame to the base frame for N poses, (N, 3)."""
+    """Return the transforms from the platform's frame to the base frame for N poses, (N, 3); a NaN hides the parts."""
+    phi = np.nan_to_num(pose[:, 2])  # the viewer draws parts with an invalid rotation at the origin
     translation, quaternion = np.zeros((len(pose), 1, 3)), np.zeros((len(pose), 1, 4))
     translation[:, 0, :2] = pose[:, :2]
-    quaternion[:, 0, 2], quaternion[:, 0, 3] = np.sin(pose[:, 2] / 2.0), np.cos(pose[:, 2] / 2.0)
+    quaternion[:, 0, 2], quaternion[:, 0, 3] = np.sin(phi / 2.0), np.cos(phi / 2.0)
     return [
         Column(path, TRANSLATION, columns.vectors(translation)),
         Column(path, QUATERNION, columns.vectors(quaternion)),
@@ -211,9 +212,9 @@ class Scene:
     def drawn(self, records: NDArray[np.void], standing: ReadoutState) -> list[Chunk]:
         """Return the drawing of one or more records, which are in order. `standing` is the state at the last record."""
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
-        newest = records[ends]
-        parts = moving(self._geometry, self._parts, records[starts], newest)
-        distance = self._reach.singularity_distance(newest["pose"])
+        distance = self._reach.singularity_distance(records["pose"][ends])
+        first, newest = _hide_unknown(records[starts]), _hide_unknown(records[ends])
+        parts = moving(self._geometry, self._parts, first, newest)
         for path, values in curves.values(records, newest, starts, distance).items():
             table = curves.with_limits(values, self._plots[path])
             parts.append(Column(path, SCALARS, columns.scalars(table)))
@@ -251,6 +252,15 @@ class Scene:
             times = self._timelines.for_records(records[changed])
             drawn += columns.chunks(times, [Column(signal.path, STATE, levels)])
         return drawn
+
+
+def _hide_unknown(records: NDArray[np.void]) -> NDArray[np.void]:
+    """Return a copy of records with NaN as the positions of sliders that are not homed, and as poses if one is not."""
+    shown = records.copy()
+    shown["position"][records["homed"] == 0] = np.nan
+    unknown = ~np.all(records["homed"], axis=1)
+    shown["pose"][unknown] = shown["commanded_pose"][unknown] = np.nan
+    return shown
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
