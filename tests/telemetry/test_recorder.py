@@ -30,7 +30,6 @@ from trirail.errors import ServiceError
 from trirail.telemetry import contents
 from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.drawn_robot import DrawnRobot
-from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import MAX_UNWRITTEN, Recorder
 from trirail.telemetry.rotation import RotatedFiles
 from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, is_watched
@@ -432,9 +431,9 @@ def test_a_live_view_is_drawn_for_only_while_somebody_watches(tmp_path: Path, mo
     drawn: list[int] = []
     draw = recording._streams.scene.drawn
 
-    def counted(records: NDArray[np.void], standing: ReadoutState) -> list[Chunk]:
+    def counted(records: NDArray[np.void], *others: Any) -> list[Chunk]:
         drawn.append(len(records))
-        return draw(records, standing)
+        return draw(records, *others)
 
     monkeypatch.setattr(recording._streams.scene, "drawn", counted)
     records = made.records(10.0)

@@ -20,6 +20,7 @@ from trirail.telemetry.columns import Timelines
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.scene import Scene
+from trirail.telemetry.streams import Streams
 from trirail.wire.records import DTYPE
 from trirail.wire.state import Info
 from trirail.wire.vocabulary import MODES, Mode
@@ -192,16 +193,32 @@ def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
     assert timing[27, [1, 3]] == pytest.approx([5000.0, 1000.0])  # with the period
 
 
-def test_a_gap_in_the_cycles_is_a_gap_in_time(scene: Scene) -> None:
-    records = np.concatenate([made.records(0.1)[:33], made.records(0.1)[58:]])
-    t = (
-        by_entity(scene.drawn(records, ReadoutState()))["/pose/phi"]
-        .to_record_batch()
-        .column("t")
-        .to_numpy()
-        .astype(int)
-    )
-    assert np.array_equal(t // 1_000_000, [9, 19, 29, 32, 59, 69, 79, 89, 99])
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_gap_in_the_cycles_is_a_gap_in_time_and_in_the_curves(scene: Scene, apart: bool) -> None:
+    """Whether the cycles are missing within a batch or between two."""
+    streams, batches = Streams(DrawnRobot.from_config(CONFIG), "x", WALL_OFFSET_NS), list[Chunk]()
+
+    class Kept:
+        def write_chunks(self, chunks: list[Chunk]) -> None:
+            batches.extend(chunks)
+
+    streams.attach(Kept(), 1000 if apart else 5)
+    records = made.records(0.1)
+    for part in (records[:33], records[58:]):
+        streams.records(part.tobytes())
+    streams.flush()
+
+    def drawn(path: str, component: str) -> dict[int, bool]:
+        """Whether there is a value, by time [ms]."""
+        of = [each for each in batches if each.entity_path == path]
+        t = np.concatenate([each.to_record_batch().column("t").to_numpy().astype(int) // 1_000_000 for each in of])
+        known = np.concatenate([np.isfinite(values(each, component)).reshape(each.num_rows, -1)[:, 0] for each in of])
+        return dict(zip(t.tolist(), known.tolist(), strict=True))
+
+    at = dict.fromkeys([9, 19, 29, 32, 59, 69, 79, 89, 99], True)
+    assert drawn("/robot/platform", "Transform3D:translation") == at
+    for path in ("/pose/phi", "/loop/timing"):
+        assert drawn(path, "Scalars:scalars") == at | {33: False}
 
 
 def test_modes_are_said_when_they_change_and_at_the_start_of_a_batch(scene: Scene) -> None:

@@ -209,16 +209,30 @@ class Scene:
         """Return complete, unchanged records as chunks for a recording file."""
         return columns.chunks(self._timelines.for_records(records), [Column(RECORD, FIELDS, columns.structs(records))])
 
-    def drawn(self, records: NDArray[np.void], standing: ReadoutState) -> list[Chunk]:
-        """Return the drawing of one or more records, which are in order. `standing` is the state at the last record."""
+    def drawn(self, records: NDArray[np.void], standing: ReadoutState, before: np.void | None = None) -> list[Chunk]:
+        """Return the drawing of one or more records, which are in order.
+
+        Parameters
+        ----------
+        records
+            Records to draw, (N,).
+        standing
+            State at the last record.
+        before
+            Last record that was drawn before; None if there is none.
+
+        """
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
         distance = self._reach.singularity_distance(records["pose"][ends])
         first, newest = _hide_unknown(records[starts]), _hide_unknown(records[ends])
         parts = moving(self._geometry, self._parts, first, newest)
+        at, begins = _gaps(records, starts, before)
+        plots = []
         for path, values in curves.values(records, newest, starts, distance).items():
-            table = curves.with_limits(values, self._plots[path])
-            parts.append(Column(path, SCALARS, columns.scalars(table)))
+            table = np.insert(curves.with_limits(values, self._plots[path]), at, np.nan, axis=0)
+            plots.append(Column(path, SCALARS, columns.scalars(table)))
         chunks = columns.chunks(self._timelines.for_records(newest), parts)
+        chunks += columns.chunks(self._timelines.for_records(np.insert(newest, at, begins)), plots)
         return chunks + self._status(records) + self._switched(records) + self._readout(records[-1], standing)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
@@ -267,6 +281,19 @@ def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDA
     """Return the first and the last row of each group. A group contains the rows of up to `size` consecutive cycles."""
     changes = np.flatnonzero(np.diff(cycles // max(1, size))) + 1
     return np.concatenate([[0], changes]), np.concatenate([changes, [len(cycles)]]) - 1
+
+
+def _gaps(
+    records: NDArray[np.void], starts: NDArray[np.intp], before: np.void | None
+) -> tuple[NDArray[np.intp], NDArray[np.void]]:
+    """Return the groups before which cycles are missing, and for each a record with the time when they began."""
+    previous = records[starts - 1]
+    previous[0] = records[0] if before is None else before
+    gaps = np.flatnonzero(records["cycle"][starts] - previous["cycle"] > 1)
+    begins = previous[gaps]
+    begins["cycle"] += 1
+    begins["deadline_ns"] += 1
+    return gaps, begins
 
 
 def _series(lines: curves.Lines) -> rr.SeriesLines:

@@ -57,6 +57,8 @@ class Streams:
         self._entries: list[Entry] = []
         self._rates: dict[Sink, int] = {}
         self._batches: dict[int, Batches] = {}
+        self._drawn: dict[int, np.void] = {}
+        """Last record that was drawn at each rate."""
         self._newest = bytes(DTYPE.itemsize)
         self._state = ReadoutState()
         self._goal_drawn = True
@@ -86,6 +88,7 @@ class Streams:
             return
         self.flush()
         self._rates[sink] = drawing_hz
+        self._drawn.clear()
         self._batches = {hz: Batches(self._rate_hz // hz, partial(self._draw, hz)) for hz in set(self._rates.values())}
 
     @property
@@ -161,7 +164,8 @@ class Streams:
         return newest
 
     def _draw(self, hz: int, records: NDArray[np.void]) -> None:
-        chunks = self._placed(self.scene.drawn(records, self._state))
+        chunks = self._placed(self.scene.drawn(records, self._state, self._drawn.get(hz)))
+        self._drawn[hz] = records[-1]
         for sink, pace in self._rates.items():
             if pace == hz:
                 sink.write_chunks(chunks)
