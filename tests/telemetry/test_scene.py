@@ -230,6 +230,17 @@ def test_modes_are_said_when_they_change_and_at_the_start_of_a_batch(scene: Scen
     assert np.array_equal(t, [0, 40_000_000])
 
 
+@pytest.mark.parametrize("fault_at", [0, 40])
+def test_the_readout_is_that_of_a_mode_from_its_first_cycle_on(scene: Scene, fault_at: int) -> None:
+    """A file has one batch of drawings per second, and a fault in its middle must not be shown as a motion."""
+    before, records = np.split(made.records(0.2), [100])
+    records["mode"][fault_at:] = MODES.index(Mode.FAULT)
+    shown = by_entity(scene.drawn(records, ReadoutState(fault="drive B: silent"), before[-1]))["/readout"]
+    t = shown.to_record_batch().column("t").to_numpy().astype(int)
+    assert np.array_equal(t // 1_000_000, [100 + fault_at, 199])
+    assert all("**FAULT**" in text for text in values(shown, "TextDocument:text")[:, 0])
+
+
 def test_what_is_still_is_there_once(scene: Scene) -> None:
     paths = [path for path, _ in scene.still()]
     assert len(set(paths)) == len(paths)

@@ -233,15 +233,19 @@ class Scene:
             plots.append(Column(path, SCALARS, columns.scalars(table)))
         chunks = columns.chunks(self._timelines.for_records(newest), parts)
         chunks += columns.chunks(self._timelines.for_records(np.insert(newest, at, begins)), plots)
-        return chunks + self._status(records) + self._switched(records) + self._readout(records[-1], standing)
+        return chunks + self._status(records) + self._switched(records) + self._readout(records, standing, before)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
         """Return the drawing of a goal's pose, shown from the time of `record` on; None erases the previous drawing."""
         return columns.chunks(self._timelines.for_records(record.reshape(1)), [goal(self._parts, pose)])
 
-    def _readout(self, record: np.void, standing: ReadoutState) -> list[Chunk]:
-        text = pa.array([[readout.markdown(record, standing, self._geometry.labels)]])
-        return columns.chunks(self._timelines.for_records(record.reshape(1)), [Column(readout.PATH, TEXT, text)])
+    def _readout(self, records: NDArray[np.void], standing: ReadoutState, before: np.void | None) -> list[Chunk]:
+        """Return the readout at the last record and, if the mode has changed, at the first record in the last mode."""
+        mode = records["mode"]
+        changes = np.flatnonzero(np.diff(mode, prepend=mode[0] if before is None else before["mode"]))
+        at = records[np.unique([*changes[-1:], len(records) - 1])]
+        texts = pa.array([[readout.markdown(record, standing, self._geometry.labels)] for record in at])
+        return columns.chunks(self._timelines.for_records(at), [Column(readout.PATH, TEXT, texts)])
 
     def _status(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return the mode and the outline of the workspace at the first record and whenever the mode or φ changes."""
