@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from rich.style import Style
 from trirail.analysis import charts
 from trirail.analysis.summary import UNKNOWN_LABEL, summarise
@@ -138,6 +139,21 @@ def test_a_place_that_is_not_known_is_not_drawn(monkeypatch: pytest.MonkeyPatch)
         assert np.isnan(drawn[panel][:100]).all()
         assert np.isfinite(drawn[panel][100:]).all()
     assert np.isnan(drawn["λ [mm]"]).sum(axis=0).tolist() == [0, 100, 0]
+
+
+@pytest.mark.parametrize("seconds", [1.0, 20.0])
+def test_what_is_missing_in_a_recording_is_a_gap_in_its_curves_and_modes(seconds: float) -> None:
+    whole = made.records(seconds)
+    begin, end = len(whole) // 4, len(whole) // 2
+    records = np.concatenate([whole[:begin], whole[end:]])
+    t = records["cycle"] / made.RATE_HZ
+    times, drawn = charts._decimate(t, records["pose"][:, 0])
+    assert np.isnan(drawn[np.searchsorted(times, t[begin]) - 1])
+    panel = Figure().subplots()
+    charts._draw_modes(panel, records, t, summarise(Recording("demo", records, t, t.astype("M8[ns]"), [], {})))
+    (bands,) = panel.collections
+    ends = [tuple(path.get_extents().intervalx) for path in bands.get_paths()]
+    assert ends == [pytest.approx((t[0], t[begin - 1])), pytest.approx((t[begin], t[-1]))]
 
 
 @pytest.mark.generated(0, 1, 2)

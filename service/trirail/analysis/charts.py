@@ -188,8 +188,9 @@ def _title(summary: Summary) -> str:
 
 def _draw_modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], summary: Summary) -> None:
     """Draw the modes as a coloured band, and the goals as bars above the band."""
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(records["mode"])) + 1])
-    ends = np.append(t[starts[1:]], t[-1])
+    gaps = _gaps(t)
+    starts = np.concatenate([[0], np.union1d(np.flatnonzero(np.diff(records["mode"])) + 1, gaps)])
+    ends = np.append(t[starts[1:] - np.isin(starts[1:], gaps)], t[-1])
     bands = [Rectangle((t[start], 0.0), end - t[start], 0.9) for start, end in zip(starts, ends, strict=True)]
     colours = [MODE_COLOURS[MODES[mode]] for mode in records["mode"][starts]]
     panel.add_collection(PatchCollection(bands, facecolors=colours, linewidths=0))
@@ -251,9 +252,24 @@ def _draw_timing(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64],
     _draw_legend(panel, handles)
 
 
+def _gaps(t: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the indices of the records before which cycles are missing."""
+    steps = np.diff(t)
+    return np.flatnonzero(steps > 1.5 * steps.min(initial=np.inf)) + 1
+
+
 def _decimate(t: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reduce a long curve to the minimum and the maximum of each bin, in order of time."""
-    size = len(values) // CURVE_BINS
+    """Reduce a long curve to the minimum and the maximum of each bin, in order of time, with NaN in each gap."""
+    gaps, size = _gaps(t), len(values) // CURVE_BINS
+    pieces = [_thin(*piece, size) for piece in zip(np.split(t, gaps), np.split(values, gaps), strict=True)]
+    times = np.concatenate([np.append(times, times[-1]) for times, _ in pieces])
+    return times, np.concatenate([np.append(thin, np.nan) for _, thin in pieces])
+
+
+def _thin(
+    t: NDArray[np.float64], values: NDArray[np.float64], size: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Reduce a curve without gaps to the minimum and the maximum of each bin of `size` values."""
     if size < 3:
         return t, values
     # The last bin is filled up with its last value. A bin is drawn as a gap only if it contains nothing but NaN.
