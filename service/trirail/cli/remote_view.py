@@ -8,11 +8,14 @@ import time
 from collections.abc import Sequence
 from types import TracebackType
 
+import msgspec
+import numpy as np
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
 from trirail.errors import ServiceError
+from trirail.telemetry.columns import SECOND
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.sinks import Relay, free_port, live_relay, live_server
@@ -78,7 +81,8 @@ class RemoteRobot:
     """Received data of one robot, and its drawing. Raises ServiceError if no records arrive.
 
     `ended` is set when the service has been restarted; nothing is drawn from then on.
-    Wall-clock times are based on this machine's clock at the first record, so they are late by the network delay.
+    Wall-clock times are based on this machine's clock at the first record, so they are late by the network delay. The
+    times of events are those of their cycles, because the service's clock may differ.
     """
 
     def __init__(self, info: Info, session: zenoh.Session, name: str, root: str, ended: threading.Event) -> None:
@@ -94,8 +98,10 @@ class RemoteRobot:
         self._reader = SampleReader()
         self._subscribe(info.robot)
         self._first_records = self._first(info)
-        offset_ns = time.time_ns() - int(unpack(self._first_records)[-1]["deadline_ns"])
-        self.streams = Streams(DrawnRobot.from_info(info), name, offset_ns, root)
+        self._newest: np.void = unpack(self._first_records)[-1]
+        self._offset_ns = time.time_ns() - int(self._newest["deadline_ns"])
+        self._rate_hz = info.rate_hz
+        self.streams = Streams(DrawnRobot.from_info(info), name, self._offset_ns, root)
         self._thread = threading.Thread(target=self._run, name=f"records of {info.robot}", daemon=True)
 
     def draw(self, relay: Relay) -> None:
@@ -148,7 +154,7 @@ class RemoteRobot:
             if isinstance(item, bytes):
                 self._records(item)
             elif isinstance(item, Event):
-                self.streams.event(item)
+                self.streams.event(self._on_this_clock(item))
             else:
                 self._state(item)
 
@@ -161,9 +167,16 @@ class RemoteRobot:
                 return
             self.lost += int(cycles[0]) - self._cycle - 1
         self._cycle = int(cycles[-1])
+        self._newest = unpack(batch)[-1]
         self.streams.records(batch)
         self._missing.check()
         self.streams.save()  # past data arrives together; in separate batches it would be skipped
+
+    def _on_this_clock(self, event: Event) -> Event:
+        """Return an event with the time of its cycle on this machine's clock."""
+        since = (event.cycle - int(self._newest["cycle"])) / self._rate_hz
+        wall = (int(self._newest["deadline_ns"]) + self._offset_ns) / SECOND + since
+        return msgspec.structs.replace(event, time=wall)
 
     def _state(self, state: State) -> None:
         goal, target = (state.goal.id, state.goal.target) if state.goal else (None, None)
