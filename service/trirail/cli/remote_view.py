@@ -25,11 +25,14 @@ from trirail.wire.credentials import Credentials
 from trirail.wire.messages import Event
 from trirail.wire.records import unpack
 from trirail.wire.state import Info, State
+from trirail.wire.vocabulary import MODES
 
 HISTORY_MB = 256.0
 """Memory for the history shown to viewers that connect late [1e6 bytes]. Nothing else runs in this process."""
 FIRST_RECORDS_TIMEOUT_S = 5.0
 """Time-out for the first records [s]."""
+SILENCE_S = 2.0
+"""Time without messages after which the last ones are shown, although no records follow them [s]."""
 MISSING = "missing data: {} cycles on the way here, {} batches in this view (viewer too slow)"
 
 
@@ -94,6 +97,8 @@ class RemoteRobot:
         """Number of cycles that were lost between the service and this program."""
         self._cycle: int | None = None
         self._bus_load: float | None = None
+        self._mode: int | None = None
+        """Mode in the newest state, as an index in MODES; None before the first state."""
         self._session = session
         self._reader = SampleReader()
         self._subscribe(info.robot)
@@ -150,13 +155,33 @@ class RemoteRobot:
         )
 
     def _run(self) -> None:
-        while not self.restarted and (item := self._queue.get()) is not None:
+        timeout: float | None = SILENCE_S
+        while not self.restarted:
+            try:
+                item = self._queue.get(timeout=timeout)
+            except queue.Empty:
+                self._show_silence()
+                timeout = None
+                continue
+            timeout = SILENCE_S
+            if item is None:
+                self.streams.flush()
+                return
             if isinstance(item, bytes):
                 self._records(item)
             elif isinstance(item, Event):
                 self.streams.event(self._on_this_clock(item))
             else:
                 self._state(item)
+
+    def _show_silence(self) -> None:
+        """Show the last events and the last mode, although no records follow, for example because the loop has died."""
+        self.streams.log("warning", f"no messages for {SILENCE_S:g} s: service ended or connection lost")
+        if self._mode is not None and self._newest["mode"] != self._mode:
+            last = self._newest.copy()
+            last["cycle"], last["mode"] = last["cycle"] + 1, self._mode
+            self.streams.records(last.tobytes())
+        self.streams.flush()
 
     def _records(self, batch: bytes) -> None:
         cycles = unpack(batch)["cycle"]
@@ -179,6 +204,7 @@ class RemoteRobot:
         return msgspec.structs.replace(event, time=wall)
 
     def _state(self, state: State) -> None:
+        self._mode = MODES.index(state.mode)
         goal, target = (state.goal.id, state.goal.target) if state.goal else (None, None)
         self.streams.update_state(ReadoutState(goal, target, state.override, "; ".join(state.faults) or None))
         if state.loop.bus_load != self._bus_load:
