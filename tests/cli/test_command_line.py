@@ -33,6 +33,7 @@ from trirail.client.goal import Result
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.telemetry import contents
+from trirail.telemetry.retention import MAGIC
 from trirail.wire.goal_kind import GoalKind, field_description
 from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.messages import GoalReply, Outcome
@@ -401,12 +402,14 @@ def test_a_refusal_is_json_with_its_code_and_what_is_allowed(capsys: pytest.Capt
     assert json.loads(capsys.readouterr().out) == {"ok": False, "error": "ServiceError", "message": "no robot"}
 
 
-def test_a_viewer_that_finds_no_display_is_an_error(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+def test_a_viewer_that_finds_no_display_is_an_error(monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path) -> None:
     """Rerun's viewer says so and exits with 0."""
+    file = tmp_path / "empty.rrd"
+    file.write_bytes(MAGIC + bytes(8))
     monkeypatch.setenv("DISPLAY", ":77")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(view, "python", lambda *_: [sys.executable, "-c", "print('Error: no X server')"])
-    code, _, err = run("view", str(SIM))
+    code, _, err = run("view", str(file))
     assert code == 1
     assert "the viewer failed: Error: no X server" in err
 

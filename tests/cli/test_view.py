@@ -29,6 +29,7 @@ from trirail.config import SIM, load
 from trirail.errors import ServiceError
 from trirail.processes import operating_system
 from trirail.processes.publications import info
+from trirail.telemetry import reading, retention
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
 from trirail.wire import zenoh_session
@@ -121,6 +122,19 @@ def test_the_browser_shows_a_recording(recording: Path, tmp_path: Path) -> None:
         found = lambda: all(near(page.picture(), colour) > 50 for colour in palette.SLIDERS)  # noqa: E731
         wait_until(found, "the sliders' colours", within=4 * WITHIN)  # drawn without a graphics card
         assert colours(page.picture()) > 40
+
+
+@pytest.mark.parametrize("state", ["whole", "cut", "growing"])
+def test_a_viewer_is_given_only_complete_messages_of_a_file(recording: Path, tmp_path: Path, state: str) -> None:
+    """It shows nothing of a file that was cut off within a message, as by a power cut or while it is being written."""
+    file = tmp_path / "demo.rrd"
+    file.write_bytes(recording.read_bytes()[: -7000 if state == "cut" else None])
+    lock = retention.lock(file) if state == "growing" else -1
+    with view._source(file, [], "", None, records=False) as (source, _):
+        retention.unlock(lock)
+        assert (source == str(file)) is (state == "whole")
+        assert Path(source).stat().st_size == reading._complete_length(Path(source)) > 100_000
+    assert Path(source).exists() is (state == "whole")
 
 
 def test_what_serves_the_browser_listens_on_the_loopback_alone(recording: Path) -> None:

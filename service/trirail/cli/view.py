@@ -22,6 +22,8 @@ from trirail_drivers import files
 from trirail.client.client import Robot
 from trirail.errors import ServiceError
 from trirail.processes.operating_system import is_here, python
+from trirail.telemetry.reading import without_partial_message
+from trirail.telemetry.retention import is_being_written
 from trirail.telemetry.sinks import LOOPBACK, free_port
 from trirail.wire.credentials import credentials_for
 from trirail.wire.endpoints import is_local
@@ -87,7 +89,8 @@ def _source(
     view has ended because a service was restarted.
     """
     if file is not None:
-        yield str(file), threading.Event()
+        with without_partial_message(file, growing=is_being_written(file)) as whole:
+            yield str(whole), threading.Event()
         return
     infos = []
     for robot in dict.fromkeys(robots):

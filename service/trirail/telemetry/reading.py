@@ -98,12 +98,12 @@ def read(path: str | os.PathLike[str]) -> Recording:
     path = Path(path)
     size = _size(path)
     try:
-        with _without_partial_message(path) as whole:
+        with without_partial_message(path) as whole:
             chunks = _chunks(whole, path)
     except ServiceError:
         if _size(path) == size:
             raise
-        with _without_partial_message(path, growing=True) as whole:  # the file was being written while Rerun read it
+        with without_partial_message(path, growing=True) as whole:  # the file was being written while Rerun read it
             chunks = _chunks(whole, path)
     texts = _static(chunks, _DOCUMENT)
     kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
@@ -194,10 +194,11 @@ def _size(path: Path) -> int | None:
 
 
 @contextmanager
-def _without_partial_message(path: Path, *, growing: bool = False) -> Iterator[Path]:
+def without_partial_message(path: Path, *, growing: bool = False) -> Iterator[Path]:
     """Yield the file itself or, if its last message was cut off, a copy without that message.
 
     Rerun cannot read a file that contains a partial message. If the file is still `growing`, always yield a copy.
+    Raises ServiceError if the file is not a recording, or cannot be read or copied.
     """
     try:
         size, length = path.stat().st_size, _complete_length(path)
