@@ -1,4 +1,4 @@
-"""Display names of sliders and drives, which are the labels in [geometry].
+"""Display names of sliders and drives, which are the labels in [geometry], and a reserved name.
 
 Programs, keys and records always use the letters A, B and C.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 from trirail_drivers.interface import NAMES
 
 Labels = tuple[str, str, str]
+BLACK_BOX = "fault"
+"""Name with which the file names of black boxes begin, which a robot cannot have."""
 
 
 def label(name: str, labels: Labels) -> str:

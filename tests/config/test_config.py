@@ -232,6 +232,7 @@ def test_shipped_configurations_load(path: Path) -> None:
             "gateway_timeout = 0.1",
             "watchdogs.gateway_timeout = 0.1: expected number, 0.2 to 10",
         ),
+        ('name = "demo"', 'name = "fault"', 'robot.name = "fault": recordings of a fault have this name'),
         ("live_mb = 64", "live_mb = 0", "telemetry.live_mb = 0: expected number, 1 to 4096"),
         ("l0 = 0.3", "l0 = nan", "geometry.l0 = nan: it must be a finite number"),
         ("l0 = 0.3", "l0 = -0.3", "geometry.l0 = -0.3: expected number, 0.001 to 100"),

@@ -29,7 +29,7 @@ from trirail.telemetry.contents import Contents, FaultEntry, read_contents
 from trirail.telemetry.journal import Line
 from trirail.telemetry.reading import join, read
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.retention import sidecar
+from trirail.telemetry.retention import is_black_box, robot_in, sidecar
 from trirail.telemetry.rotation import claim
 from trirail.telemetry.sessions import RecordedSession, SessionFilter, find, recorded
 from trirail.wire.goals import PoseGoal
@@ -590,6 +590,16 @@ def test_what_stands_beside_a_recording_is_what_was_in_it(found: list[Contents])
 def test_the_name_of_a_black_box_is_that_of_its_faults_time() -> None:
     moment = datetime(2026, 1, 31, 12, 0, 5).astimezone().timestamp()
     assert contents.box_name(moment) == "fault-20260131-120005"
+
+
+def test_a_robot_whose_name_begins_like_that_of_a_black_box_has_usual_recordings(tmp_path: Path) -> None:
+    file = record(tmp_path, name="fault-line")
+    sidecar(file).unlink()
+    (session,) = (each for each in find(recorded(tmp_path)) if file.name in each.files)
+    assert (session.robot, session.reason) == ("fault-line", None)
+    assert (robot_in(file.name), robot_in("fault-20260131-120000.rrd")) == ("fault-line", "")
+    assert not is_black_box(file.name)
+    assert is_black_box("fault-20260131-120000 of Monday.rrd")
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from trirail.errors import ConfigError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry, det_j2, gains, singular_angles, travels
 from trirail.kinematics.slices import clip, joint_rows
+from trirail.naming import BLACK_BOX
 from trirail.quantities import FAMILIAR_UNITS, as_familiar_unit
 from trirail.wire.text import QUANTITY_RULE, is_quantity
 
@@ -92,6 +93,7 @@ def rules(config: Config) -> Iterator[Rule]:
         **dict(zip(slider.keys("position"), slider.positions, strict=True)),
         "limits.slider.passive": slider.passive,
     }
+    yield Rule("robot.name", (), partial(_check_name, config))
     for key, both in ranges.items():
         yield Rule(key, (), partial(_check_range, key, *both))
     yield Rule("geometry", (), partial(geometry, config.geometry))
@@ -115,6 +117,11 @@ def rules(config: Config) -> Iterator[Rule]:
     yield Rule("loop.rate_hz", (), partial(_check_rate, config))
     yield from settings_checks.bus_rules(config.can, config.drives.protocol)
     yield from settings_checks.rules(config.drives, _required(config))
+
+
+def _check_name(config: Config) -> None:
+    if config.robot.name == BLACK_BOX:
+        raise ConfigError(f'robot.name = "{BLACK_BOX}": recordings of a fault have this name; choose another')
 
 
 def _check_range(key: str, low: float, high: float) -> None:

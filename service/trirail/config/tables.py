@@ -45,7 +45,7 @@ class RobotTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [robot]."""
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$(?!\n)")]
-    """Name of the robot, the <robot> in every Zenoh key: letters, digits, - and _."""
+    """Name of the robot, the <robot> in every Zenoh key: letters, digits, - and _; not "fault"."""
 
 
 class LegTable(Struct, frozen=True, forbid_unknown_fields=True):

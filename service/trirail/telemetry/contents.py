@@ -16,7 +16,8 @@ from msgspec import Meta
 from trirail_drivers import files
 
 from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
-from trirail.telemetry.retention import BLACK_BOX, STAMP, robot_in, session_of, sidecar
+from trirail.naming import BLACK_BOX
+from trirail.telemetry.retention import STAMP, is_black_box, robot_in, session_of, sidecar
 from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.messages import Event, FaultDetail, Notice, Outcome
 from trirail.wire.packets import Announcement, CheckRequest, CommandRequest, ControlInput, GoalRequest
@@ -140,7 +141,7 @@ def read_contents(path: Path) -> Contents:
             contents.event(line.event)
     for item in recording.requests:
         contents.control_input(item)
-    if path.name.startswith(BLACK_BOX):
+    if is_black_box(path.name):
         contents.reason = _reason(contents)
     return contents
 
@@ -154,4 +155,4 @@ def _reason(contents: Contents) -> str | None:
 
 def box_name(fault_time: float) -> str:
     """Return the name, without suffix, of the black box for a fault at `fault_time` [s since 1970]."""
-    return f"{BLACK_BOX}{datetime.fromtimestamp(fault_time).astimezone():{STAMP}}"
+    return f"{BLACK_BOX}-{datetime.fromtimestamp(fault_time).astimezone():{STAMP}}"

@@ -19,11 +19,12 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
 
+from trirail.naming import BLACK_BOX
+
 MAGIC = b"RRF2"
 """First bytes of an RRD file: Rerun's crate re_log_encoding, src/rrd/frames.rs."""
-BLACK_BOX = "fault-"
-"""Prefix of the names of black boxes."""
 _PART = re.compile(r"-part\d+(-\d+)?$")
+_BLACK_BOX = re.compile(rf"{BLACK_BOX}-\d{{8}}-\d{{6}}")
 _NAME = re.compile(
     r"(?P<name>[A-Za-z0-9_-]+)-(?P<date>\d{8}-\d{6})(-(?P<number>\d+))?"
     r"(-part(?P<part>\d+)(-(?P<again>\d+))?)?\.rrd"
@@ -81,7 +82,12 @@ def name_in_order(directory: Path, name: str) -> str:
 def robot_in(name: str) -> str:
     """Return the robot in a file name that the recorder chose; "" for a black box and for other names."""
     match = _NAME.fullmatch(name)
-    return match["name"] if match is not None and not name.startswith(BLACK_BOX) else ""
+    return match["name"] if match is not None and not is_black_box(name) else ""
+
+
+def is_black_box(name: str) -> bool:
+    """Return True if a file name begins like that of a black box, as that of a copy does."""
+    return _BLACK_BOX.match(name) is not None
 
 
 def sidecar(recording: Path) -> Path:
@@ -224,4 +230,4 @@ def _recordings(directory: Path, session: str) -> Iterator[_StoredRecording]:
             size = path.stat().st_size + (log.stat().st_size if log.exists() else 0)
         except OSError:  # another process has just deleted the recording, or it is a link that leads nowhere
             continue
-        yield _StoredRecording(path, size, (f"{order.name}-" == BLACK_BOX, session_of(path.name) == session, order))
+        yield _StoredRecording(path, size, (is_black_box(path.name), session_of(path.name) == session, order))
