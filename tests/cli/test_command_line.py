@@ -20,6 +20,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import made
 import msgspec
 import pytest
 from cyclopts import App
@@ -33,6 +34,8 @@ from trirail.client.goal import Result
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.telemetry import contents
+from trirail.telemetry.reading import read
+from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.retention import MAGIC
 from trirail.wire.goal_kind import GoalKind, field_description
 from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
@@ -619,6 +622,24 @@ def test_ctrl_c_while_a_command_is_loaded_ends_it_without_a_word(starter: str) -
     )
     ended = subprocess.run([sys.executable, "-c", loading], capture_output=True, check=False, timeout=300)
     assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, b"", b"")
+
+
+def test_a_command_draws_though_the_shell_switches_rerun_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views, demos and recordings would be empty. Such a shell is made for other programs."""
+    path = tmp_path / "made.rrd"
+
+    def command(*_: object, **__: object) -> int:
+        recorder = Recorder(load(SIM), tmp_path, path=path, live=False)
+        recorder.records(made.records(0.1).tobytes())
+        recorder.close()
+        return 0
+
+    monkeypatch.setenv("RERUN", "off")
+    monkeypatch.setattr(app, "app", command)
+    monkeypatch.setattr(sys, "argv", ["trirail", "view"])
+    with pytest.raises(SystemExit):
+        app.main()
+    assert len(read(path).records) == 100
 
 
 def test_a_number_of_things_is_said_as_people_say_it() -> None:

@@ -295,6 +295,7 @@ def _terminated(number: int, _frame: FrameType | None) -> None:
 def main() -> None:
     """Run a command and exit with its exit code."""
     words = sys.argv[1:]
+    os.environ["RERUN"] = "on"  # otherwise a shell that switches Rerun off for other programs would empty every view
     warnings.showwarning = lambda message, *_, **__: terminal.print_error(str(message))
     try:
         for number in (signal.SIGTERM, signal.SIGHUP):

@@ -56,9 +56,8 @@ A terminal sends all but the last to all of its processes: on Ctrl-C, Ctrl-\\ an
 process in the background uses it. systemd sends SIGINT to all processes of a service to end it, also when the
 supervisor has died, and SIGABRT when the supervisor no longer feeds the watchdog.
 """
-RERUN_ENVIRONMENT: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0", "RERUN": "on"}
-"""Environment for Rerun: its allocator reserves no memory in advance, and it records, whatever the user's shell says.
-"""
+RERUN_ENVIRONMENT: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
+"""Environment for Rerun: its allocator reserves no memory in advance."""
 MAX_PACKET_BYTES = 4096
 """Maximum size of a packet on the control socket [bytes]."""
 
