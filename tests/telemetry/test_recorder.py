@@ -356,6 +356,7 @@ class _Stream:
 
 
 def test_a_slow_viewer_is_skipped_to_the_newest() -> None:
+    """It gets all lines of the log and changes of the goal: a fault or the end of a goal would never be shown."""
     began, go_on, finished = threading.Event(), threading.Event(), threading.Event()
     delivered: list[Any] = []
 
@@ -365,7 +366,10 @@ def test_a_slow_viewer_is_skipped_to_the_newest() -> None:
         delivered.append(batch)
 
     relay = Relay(deliver, finished.set)
-    batches: list[Any] = [[number] for number in range(2 * BACKLOG + 5)]
+    batches: list[Any] = [[SimpleNamespace(entity_path="/left/mode")] for _ in range(2 * BACKLOG + 5)]
+    lasting = [SimpleNamespace(entity_path=f"/left{path}") for path in ("/robot/goal", "/events", "/events")]
+    for place, chunk in zip((3, 7, BACKLOG + 9), lasting, strict=True):
+        batches[place].append(chunk)
     relay.write_chunks(batches[0])
     assert began.wait(WITHIN)
     for batch in batches[1:]:
@@ -374,7 +378,8 @@ def test_a_slow_viewer_is_skipped_to_the_newest() -> None:
     relay.close()
     assert finished.is_set()
     assert relay.skipped == 2 * BACKLOG
-    assert delivered == [batches[0], *batches[2 * BACKLOG + 1 :]]
+    first, *others = batches[2 * BACKLOG + 1 :]
+    assert delivered == [batches[0], [*lasting, *first], *others]
 
 
 class Kept:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 SECOND = 1_000_000_000  # [ns]
+GOAL = "/robot/goal"
+"""Entity path of the outline of the platform at the goal."""
 RECORD, FIELDS = "/record", rr.ComponentDescriptor("fields")
 """Entity path and component that store the complete record of each cycle in a recording."""
 

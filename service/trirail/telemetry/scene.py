@@ -56,7 +56,7 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
     yield "/robot/platform/outline", _lines(parts.outline, [palette.PLATFORM], 2.2, order=22)
     yield "/robot/platform/stops", _lines(parts.edge_stops, [palette.LIMIT], 1.2, order=23)
     yield "/robot/workspace", _strips([palette.WORKSPACE], 0.8, order=15)
-    yield "/robot/goal", _strips([palette.GOAL], 1.0, order=24)
+    yield columns.GOAL, _strips([palette.GOAL], 1.0, order=24)
     # These are the sleeves in which the platform's edges slide, or the cross slides on the carriages.
     yield "/robot/passive", _strips([palette.dark(c) for c in palette.SLIDERS], 5.5, order=25)
     yield "/robot/trace", _strips([palette.CENTRE], 1.2, order=30)
@@ -95,10 +95,10 @@ def moving(geometry: Geometry, parts: RobotParts, before: NDArray[np.void], reco
 def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
     """Return the outline of the platform at the goal's pose, with a cross at the centre; empty if `pose` is None."""
     if pose is None:
-        return Column("/robot/goal", STRIPS, columns.ragged([[]]))
+        return Column(columns.GOAL, STRIPS, columns.ragged([[]]))
     cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _ORIGIN_CROSS]
     lines = part_positions.transform_lines([*parts.outline, *cross], pose)
-    return Column("/robot/goal", STRIPS, columns.ragged([lines]))
+    return Column(columns.GOAL, STRIPS, columns.ragged([lines]))
 
 
 def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsComponents]]:

@@ -20,10 +20,16 @@ import rerun as rr
 from rerun.chunk import Chunk
 
 from trirail.errors import ServiceError
+from trirail.telemetry.columns import GOAL
+from trirail.telemetry.journal import EVENTS
 
 LOOPBACK = "127.0.0.1"
 BACKLOG = 20
 """Maximum number of batches that wait for the live view, which is the data of about 2 s."""
+LASTING = EVENTS, GOAL
+"""Entities of which the view needs every chunk: a lost line of the log or change of a goal would never be shown."""
+MAX_LASTING = 1000
+"""Maximum number of chunks of such entities that wait for the live view in addition to the batches."""
 RESERVE = 64 << 20
 """Space that is left free on the disk [bytes]. Rerun's file sink never recovers from a full disk."""
 DISK_TIMEOUT_S = 2.0
@@ -136,7 +142,8 @@ class Archive:
 class Relay:
     """Thread that passes batches to a receiver.
 
-    If BACKLOG batches are waiting when another batch arrives, the waiting batches are dropped.
+    If BACKLOG batches are waiting when another batch arrives, the waiting batches are dropped, except their events and
+    goals.
     """
 
     def __init__(self, deliver: Callable[[list[Chunk]], None], finish: Callable[[], None]) -> None:
@@ -145,6 +152,7 @@ class Relay:
         self._deliver = deliver
         self._finish = finish
         self._waiting: deque[list[Chunk]] = deque()
+        self._lasting: deque[Chunk] = deque(maxlen=MAX_LASTING)
         self._changed = threading.Condition()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
@@ -155,6 +163,8 @@ class Relay:
         with self._changed:
             if len(self._waiting) == BACKLOG:
                 self.skipped += BACKLOG
+                dropped = (chunk for batch in self._waiting for chunk in batch)
+                self._lasting.extend(chunk for chunk in dropped if chunk.entity_path.endswith(LASTING))
                 self._waiting.clear()
             self._waiting.append(chunks)
             self._changed.notify()
@@ -174,7 +184,11 @@ class Relay:
     def _next(self) -> list[Chunk] | None:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._closing)
-            return self._waiting.popleft() if self._waiting else None
+            if not self._waiting:
+                return None
+            chunks = [*self._lasting, *self._waiting.popleft()]
+            self._lasting.clear()
+            return chunks
 
 
 def free_port() -> int:
