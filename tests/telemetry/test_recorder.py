@@ -282,12 +282,13 @@ def test_a_stuck_disk_is_left_alone_until_it_answers() -> None:
 def test_a_batch_that_a_slow_disk_writes_late_is_not_written_twice() -> None:
     stream = _Stream()
     archive = Archive(stream, Path("/tmp/x.rrd"))  # type: ignore[arg-type]
-    first, second = (SimpleNamespace(id=name) for name in "ab")
+    first, second, third = (SimpleNamespace(id=name) for name in "abc")
     stream.stuck = True
     archive.write_chunks([first])  # type: ignore[list-item]
     stream.stuck = False
-    archive.write_chunks([first, second])  # type: ignore[list-item]
-    assert stream.chunks == [first, second]
+    archive.write_chunks([second])  # type: ignore[list-item]
+    archive.write_chunks([first, third])  # type: ignore[list-item]
+    assert stream.chunks == [first, second, third]
 
 
 def test_many_inputs_on_a_full_disk_displace_no_event(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -89,13 +89,13 @@ class Archive:
         self._directory = path.parent
         self._identity = identity(path)
         self._stuck = False
-        self._sent: set[str] = set()
-        """Ids of the chunks that were passed to Rerun last. A slow disk writes them later."""
+        self._late: set[str] = set()
+        """Ids of the chunks of lost batches that were passed to Rerun. A slow disk writes them later."""
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
         """Write a batch without waiting long for the disk; if writing fails, count the batch as lost.
 
-        A chunk of a lost batch may be given again in the next batch, and is not written twice.
+        A chunk of a lost batch may be given again in a later batch, and is not written twice.
         """
         self.trouble = self._write(chunks)
         self.lost += bool(self.trouble)
@@ -124,9 +124,9 @@ class Archive:
         if full := disk_shortage(self._directory, self._reserve):
             return full
         if not self._stuck or self._flushed(0.01):
-            self._stream.send_chunks([chunk for chunk in chunks if chunk.id not in self._sent])
-            self._sent = {chunk.id for chunk in chunks}
-            self._flushed(DISK_TIMEOUT_S)
+            self._stream.send_chunks([chunk for chunk in chunks if chunk.id not in self._late])
+            if not self._flushed(DISK_TIMEOUT_S):
+                self._late.update(chunk.id for chunk in chunks)
         return f"{self._directory} cannot be written: disk failing or read-only, or a quota" if self._stuck else ""
 
     def _flushed(self, within: float) -> bool:
