@@ -53,3 +53,20 @@ def test_setpoints_are_timed_from_the_deadline_to_the_last_one(times: list[tuple
     worst = max(late + 6 * part for late, part in times)
     assert loop.setpoints_us.max == pytest.approx(worst / 1e3, abs=0.1)
     assert loop.setpoint_budget_us == pytest.approx(250.0)
+
+
+@pytest.mark.parametrize("homing", [False, True])
+def test_no_jump_of_what_is_known_counts_as_a_motion(homing: bool) -> None:
+    """Neither the begin of a gateway that is restarted during a motion, nor the end of homing, which sets the pose."""
+    maker, rows = StateMaker(CONFIG), np.zeros(200, DTYPE)
+    rows["cycle"] = np.arange(200)
+    rows["pose"][:, 0] = 0.2 * CONFIG.period * np.arange(200)  # 0.2 m/s
+    if homing:
+        rows["homed"][100:], rows["pose"][:100] = True, 0.5
+    states = []
+    for start in range(0, 200, 20):
+        maker.records(rows[start : start + 20])
+        states.append(maker.newest())
+    velocities = [0.0] * 6 + [0.2] * 4 if homing else [0.0] + [0.2] * 9
+    assert [state.velocity[0] for state in states] == pytest.approx(velocities)
+    assert [state.acceleration[0] for state in states] == pytest.approx([0.0] * 10, abs=1e-9)

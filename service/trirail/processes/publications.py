@@ -126,7 +126,9 @@ class StateMaker:
         self._statistics = [_NONE, _NONE, _NONE]
         self._statistics_due = 0
         self._newest: Any = None
-        self._velocity = self._acceleration = np.zeros(3)
+        self._velocity: NDArray[np.float64] | None = None
+        """Velocity between the last two records; None if there is none, because a position became known or unknown."""
+        self._acceleration = np.zeros(3)
         self._error_max = np.zeros(3)
         self._welcome = Welcome((), 0.0)
         self._status = Status(None, 1.0, None)
@@ -141,13 +143,15 @@ class StateMaker:
     def records(self, rows: NDArray[np.void]) -> None:
         """Store the newest record of a batch, and update the velocities and the statistics."""
         newest, before = rows[-1], self._newest
-        if before is not None:
+        velocity, self._acceleration = None, np.zeros(3)
+        if before is not None and np.array_equal(newest["homed"], before["homed"]):
             # Velocities are differences over a batch, not over a cycle: at 1 kHz, one encoder count per cycle would be
             # a large step in velocity.
             span = (int(newest["cycle"]) - int(before["cycle"])) * self._period
             velocity = (newest["pose"] - before["pose"]) / span
-            self._acceleration = (velocity - self._velocity) / span
-            self._velocity = velocity
+            if self._velocity is not None:
+                self._acceleration = (velocity - self._velocity) / span
+        self._velocity = velocity
         self._newest = newest.copy()
         enabled = rows["following_error"][np.isin(rows["mode"], _ENABLED)]
         if len(enabled):
@@ -183,7 +187,7 @@ class StateMaker:
             time=round((int(row["deadline_ns"]) + self._offset_ns()) * 1e-9, 6),
             mode=MODES[row["mode"]],
             pose=Pose(*row["pose"].tolist()),
-            velocity=_triple(self._velocity),
+            velocity=_triple(np.zeros(3) if self._velocity is None else self._velocity),
             acceleration=_triple(self._acceleration),
             commanded=CommandedMotion(
                 pose=Pose(*row["commanded_pose"].tolist()),
