@@ -54,6 +54,20 @@ def test_a_recording_and_its_folder_are_not_for_others(umask: int, tmp_path: Pat
     assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o750 & ~umask
 
 
+def test_the_last_packets_of_a_loop_that_has_left_a_packet_unread_are_recorded(tmp_path: Path) -> None:
+    """The kernel reports the unread packet as an error, before it delivers what the loop has sent."""
+    ours, loops = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    records = made.records(0.1)
+    loops.send(bytes((Kind.RECORDS,)) + records.tobytes())
+    ours.send(b"a notice")
+    loops.close()
+    heart = Heartbeats.create().heart("recorder")
+    with ours:
+        recording.main(config_in(tmp_path), None, PacketLink(ours), heart, lambda _: None, lambda _: None, lambda: 99)
+    (file,) = tmp_path.glob("*.rrd")
+    assert len(read(file).records) == len(records)
+
+
 class BusyLink(PacketLink):
     """A link on which another packet is always waiting, until 1000 packets have been received."""
 

@@ -207,6 +207,11 @@ def main(
                 sent_at = time.monotonic()
                 report_measurements(RecorderMeasurements(*intake.recorder.missing))
     except LinkClosed:
+        with contextlib.suppress(
+            LinkClosed
+        ):  # if the loop has left a packet unread, its own follow after the first error
+            for packet in iter(link.receive, None):
+                intake.on_packet(packet)
         intake.loop_gone()
     finally:
         heart.rest()  # completing the files may take longer than the time-out of the heartbeat
