@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import math
 import threading
 import time
 from collections import deque
@@ -25,6 +26,7 @@ from trirail.processes.operating_system import is_here
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.goals import PoseGoal
 from trirail.wire.looks import AlignmentLook
+from trirail.wire.state import State
 from trirail.wire.vocabulary import Role
 
 SILENCE_S = 1.0
@@ -33,10 +35,12 @@ RESTART_S = 0.5
 """Minimum change of the service's start time that shows a restart [s].
 
 A restart takes longer, and the start time also changes by the ticks that the loop misses between two states."""
+MAX_DRIFT = 1e-3
+"""Maximum relative difference in speed of the clocks of this machine and the service's machine."""
 MAX_STATE_AGE_S = 0.5
 """Minimum of the limit of the age of the newest state on the page at which the page can move the robot [s].
 
-If the state is older, the page or its connection has stalled, and the operator pressed the button some time ago."""
+If the state is older, the page or a connection has stalled, and the operator pressed the button some time ago."""
 USERS_PERIOD_S = 2.0
 """Interval between queries of the connected users, and of a description that has not been answered [s]."""
 MAX_EVENTS = 200
@@ -67,7 +71,9 @@ class Feed:
         self.state: bytes | None = None
         """Newest state and its stamp as JSON; None while the service is silent or its description is not known."""
         self.stamp = 0
-        """Arrival time of the newest state, in milliseconds of this process's monotonic clock."""
+        """Time of the newest state, in milliseconds of this process's monotonic clock: its arrival time, unless it was
+        delayed more than others.
+        """
         self._events: deque[tuple[int, bytes]] = deque(maxlen=MAX_EVENTS)
         self._alignment_events: list[tuple[int, bytes]] = []
         """Events of the latest alignment, which are stored even after MAX_EVENTS later events."""
@@ -112,6 +118,7 @@ class Feed:
     async def _receive_states(self) -> None:
         is_new = False
         started: float | None = None
+        delay = Delay()
         while True:
             async with aclosing(self._robot.states(self._info.state_timeout(SILENCE_S))) as states:
                 async for state in states:
@@ -120,10 +127,10 @@ class Feed:
                     last, started = started, state.time - state.t
                     if is_new or (last is not None and abs(started - last) > RESTART_S):
                         await self._describe()
-                        is_new = False
+                        is_new, delay = False, Delay()
                     if self.trouble:  # the page would use the limits and the drawing of another robot
                         continue
-                    stamp = now()
+                    stamp = round(delay.subtract(now(), state))
                     content = msgspec.json.encode({"tell": "state", "stamp": stamp, "state": state})
                     with self.changed:
                         self.state, self.stamp, self._pose = content, stamp, state.measured_pose
@@ -210,6 +217,22 @@ class Feed:
         name = look.id, look.purpose
         self._alignment_events = [*(self._alignment_events if name == self._alignment else ()), event][-MAX_LOOKS:]
         self._alignment = name
+
+
+class Delay:
+    """Delay of states on their way here, compared with the shortest one."""
+
+    def __init__(self) -> None:
+        self._shortest = math.inf
+        self._last = 0.0
+
+    def subtract(self, arrival: float, state: State) -> float:
+        """Return the time at which a state would have arrived with the shortest delay, given its `arrival` [ms]."""
+        # Missed ticks are not part of the service's nominal time.
+        sent = (state.t + state.loop.overruns / state.loop.rate_hz) * 1e3
+        self._shortest = min(arrival - sent, self._shortest + MAX_DRIFT * (arrival - self._last))
+        self._last = arrival
+        return sent + self._shortest
 
 
 def now() -> int:
