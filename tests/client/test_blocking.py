@@ -300,6 +300,20 @@ def test_a_goal_that_a_stop_overtakes_on_its_way_is_stopped_when_it_is_accepted(
         assert f"{stop.key_expr} {stop.payload.to_string()}" == 'trirail/demo/cmd/ann/stop {"goal":"g"}'
 
 
+@pytest.mark.parametrize("name", [name for name in Command if name.starts])
+@pytest.mark.parametrize("stop", STOPS)
+def test_a_command_that_a_stop_overtakes_on_its_way_is_followed_by_that_stop(
+    robot: Robot, slow: Slow, name: str, stop: str
+) -> None:
+    sending = Call(lambda: robot.command(name))
+    late = slow.next()
+    stop_and_confirm(robot, slow, stop)
+    reply(late, CommandReply(name, "holding", 2))
+    assert sending.end().mode == "holding"
+    with slow.next() as again:
+        assert str(again.key_expr) == f"trirail/demo/cmd/ann/{stop}"
+
+
 @pytest.mark.parametrize("name", ["pause", "the stop of another goal"])
 def test_a_goal_under_way_outlives_what_does_not_stop_it(robot: Robot, slow: Slow, name: str) -> None:
     with congested(robot):

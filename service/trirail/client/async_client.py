@@ -609,7 +609,12 @@ class AsyncRobot:
             return await self._connection.stop(self.user, name, payload, REPLY_WITHIN)
         within = {Command.HOME: HOME_WITHIN, Command.ENABLE: ENABLE_WITHIN}.get(command, REPLY_WITHIN)
         before = began if command.starts else math.inf
-        return await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
+        reply = await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
+        # A later stop may have overtaken the command on its separate way.
+        for overtaking in self._connection.later_stops(before) & STOPS:
+            with contextlib.suppress(ServiceError):  # the connection is closed
+                self._connection.query_unanswered(("cmd", self.user, overtaking), None)
+        return reply
 
     async def info(self) -> Info:
         """Return the robot's geometry, limits, rates and versions."""
