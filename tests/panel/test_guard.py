@@ -645,3 +645,21 @@ def test_a_service_of_another_version_is_told_in_one_line() -> None:
     robot.told = msgspec.structs.replace(robot.told, limits={"platform": {}})
     with pytest.raises(ServiceError, match="another version"):
         Panel(robot.robot(), 0)
+
+
+def test_a_state_that_was_delayed_has_its_own_time() -> None:
+    """Whether ticks were missed meanwhile or not, and however the clocks of the two machines drift."""
+    delay, state = feed.Delay(), FakeRobot().state()
+
+    def came(at: float, delayed: float, overruns: int = 0) -> float:
+        loop = msgspec.structs.replace(state.loop, overruns=overruns)
+        sent = (at - delayed) * 1.0001
+        return (
+            delay.subtract(at * 1e3, msgspec.structs.replace(state, t=sent - overruns / loop.rate_hz, loop=loop)) / 1e3
+        )
+
+    for number in range(1, 5_000):
+        assert abs(came(number * 2.0, 0.03) - number * 2.0) < 3e-3
+    assert abs(came(10_001.0, 0.03, overruns=2000) - 10_001.0) < 2e-3
+    for number in range(20):
+        assert abs(came(10_002.0 + number * 0.2, 2.03, overruns=2000) - (10_000.0 + number * 0.2)) < 0.02

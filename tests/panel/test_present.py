@@ -248,24 +248,6 @@ def test_what_is_pressed_on_a_page_that_is_late_is_refused_in_words(
     enabled.evaluate("localStorage.clear()")
 
 
-def test_a_state_that_was_delayed_has_its_own_time() -> None:
-    """Whether ticks were missed meanwhile or not, and however the clocks of the two machines drift."""
-    delay, state = feed.Delay(), FakeRobot().state()
-
-    def came(at: float, delayed: float, overruns: int = 0) -> float:
-        loop = msgspec.structs.replace(state.loop, overruns=overruns)
-        sent = (at - delayed) * 1.0001
-        return (
-            delay.subtract(at * 1e3, msgspec.structs.replace(state, t=sent - overruns / loop.rate_hz, loop=loop)) / 1e3
-        )
-
-    for number in range(1, 5_000):
-        assert abs(came(number * 2.0, 0.03) - number * 2.0) < 3e-3
-    assert abs(came(10_001.0, 0.03, overruns=2000) - 10_001.0) < 2e-3
-    for number in range(20):
-        assert abs(came(10_002.0 + number * 0.2, 2.03, overruns=2000) - (10_000.0 + number * 0.2)) < 0.02
-
-
 # ---------------------------------------------------------------------- what cannot work
 
 
