@@ -26,10 +26,10 @@ from trirail.client.blocking import Jog, Lease, LoopThread
 from trirail.client.client import Robot
 from trirail.client.connection import Connection
 from trirail.client.new_stop import NewStop
-from trirail.errors import RefusalCode, ServiceError, TrirailError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import zenoh_session
 from trirail.wire.goals import Goal, PoseGoal
-from trirail.wire.messages import CommandReply, Event, GoalReply
+from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.vocabulary import Command, Stop
 from waiting import WITHIN, wait_until
@@ -263,6 +263,85 @@ def test_a_path_that_is_read_while_a_stop_is_carried_out_is_not_followed(robot: 
     stop_and_confirm(robot, slow, stop)
     read.set()
     assert (following.end().code, slow.asked.qsize()) == (RefusalCode.STOPPED, 0)
+
+
+@pytest.fixture
+def stopping_signal(robot: Robot) -> Iterator[int]:
+    """A signal whose handler stops the robot."""
+    before = signal.signal(signal.SIGUSR1, lambda *_: robot.stop())
+    yield signal.SIGUSR1
+    signal.signal(signal.SIGUSR1, before)
+
+
+def test_a_path_that_is_read_while_a_signal_handler_stops_is_not_followed(
+    robot: Robot, answered: list[str], stopping_signal: int
+) -> None:
+    def rows() -> Iterator[tuple[float, float, float, float]]:
+        yield (0.0, 0.0, 0.0, 0.0)
+        signal.raise_signal(stopping_signal)
+        yield (1.0, 0.01, 0.0, 0.0)
+
+    with pytest.raises(RefusedError, match="came first"):
+        robot.follow(rows())
+    assert answered == ["trirail/demo/cmd/ann/stop "]
+
+
+@pytest.mark.parametrize("name", STARTING)
+def test_a_call_that_a_signal_handler_interrupts_to_stop_sends_nothing_after_the_stop(
+    robot: Robot, answered: list[str], stopping_signal: int, name: str
+) -> None:
+    main = threading.get_ident()
+    with congested(robot) as free:
+
+        def press() -> None:
+            wait_until(lambda: waits(main))
+            signal.pthread_kill(main, stopping_signal)
+            wait_until(lambda: bool(answered))
+            free.set()
+
+        pressing = threading.Thread(target=press)
+        pressing.start()
+        with pytest.raises(RefusedError, match="came first"):
+            STARTING[name](robot)
+    pressing.join()
+    assert answered == ["trirail/demo/cmd/ann/stop "]
+
+
+@pytest.mark.parametrize("taken_back", ["resumed", "refused"])
+def test_a_path_begins_after_a_pause_that_was_taken_back_on_the_way_to_its_first_point(
+    robot: Robot, slow: Slow, monkeypatch: pytest.MonkeyPatch, taken_back: str
+) -> None:
+    arrived, go_on = threading.Event(), threading.Event()
+
+    def check(_: object) -> None:
+        arrived.set()
+        assert go_on.wait(WITHIN)
+
+    monkeypatch.setattr(async_client, "check_arrived", check)
+    following = Call(lambda: robot.follow([(0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 0.0, 0.0)], go_there=True))
+    way = slow.next()
+    assert way.payload is not None
+    goal_id = msgspec.json.decode(way.payload.to_bytes())["id"]
+    reply(way, GoalReply(goal_id, 1.0))
+    pausing = Call(robot.pause)
+    with slow.next() as query:
+        if taken_back == "resumed":
+            query.reply(query.key_expr, msgspec.json.encode(CommandReply("pause", "holding", 1)))
+        else:
+            query.reply_err(msgspec.json.encode(ErrorReply(RefusalCode.NO_GOAL, "no goal is in progress")))
+    pausing.end()
+    if taken_back == "resumed":
+        resuming = Call(robot.resume)
+        reply(slow.next(), CommandReply("resume", "moving", 2))
+        resuming.end()
+    ended = Event("goal", "info", "done", id=goal_id, outcome="done", seq=1, t=0.0, cycle=0, time=1.0)
+    slow.session.put("trirail/demo/event", msgspec.json.encode(ended))
+    assert arrived.wait(WITHIN)
+    go_on.set()
+    path = slow.next()
+    assert str(path.key_expr).startswith("trirail/demo/goal/ann")
+    reply(path, GoalReply("p", 1.0))
+    following.end()
 
 
 def test_a_path_does_not_begin_after_a_stop_that_came_when_its_first_point_was_reached(

@@ -201,7 +201,7 @@ class Remote:
         Some drives pad each value to four bytes. Other bytes are part of a value that is longer than in the EDS.
         """
         variable = self.client.od.get_variable(*key)
-        if len(data) > EXPEDITED or variable is None or not variable.fixed_size:
+        if not data or len(data) > EXPEDITED or variable is None or not variable.fixed_size:
             return data
         own = data[: len(variable) // 8]
         is_negative = variable.data_type in SIGNED_TYPES and own[-1] & 0x80

@@ -142,8 +142,7 @@ async def drive_async(
             else:
                 if isinstance(request, StageMotion):
                     for goal in goals(request, speed):
-                        with called(began):  # after a later stop, the procedure must not continue
-                            await _move(robot, goal, next(ids))
+                        await _move(robot, goal, next(ids), began)
                     await completed(sleep(wait))
                     marks = sight.marks
                 else:
@@ -181,10 +180,12 @@ async def _report(robot: StageRobot, reports: LookReports, message: bytes | None
         reports.lost(error)
 
 
-async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
+async def _move(robot: StageRobot, goal: Goal, goal_id: str, began: float) -> None:
+    """Carry out a goal of a procedure that began at the time `began` [s], unless a stop has been called since then."""
     handle: MotionHandle | None = None
     try:
-        handle = await completed(robot.send(structs.replace(goal, id=goal_id)))
+        with called(began):
+            handle = await completed(robot.send(structs.replace(goal, id=goal_id)))
         check(await completed(handle.wait((handle.duration or 0.0) + GOAL_WITHIN)))
     except RefusedError:  # the goal was refused or has ended
         raise

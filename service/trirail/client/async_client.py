@@ -41,7 +41,7 @@ from trirail.client.outgoing import (
 )
 from trirail.client.track import AsyncTrack, Taker
 from trirail.client.trajectory import Points, check_arrived, first_pose, points_of
-from trirail.errors import ServiceError
+from trirail.errors import RefusedError, ServiceError
 from trirail.wire.goals import Goal, MoveGoal, NamedGoal, OwnLimits, PoseGoal, SlidersGoal, Tool, TrajectoryGoal
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.marks import MarkLike, StopAtLike, marks_of, stop_at_of
@@ -603,10 +603,8 @@ class AsyncRobot:
         began = called_at()
         payload = content_message(name, content)
         command = Command(name)
-        if command.stops and stops_everything(command, payload):
-            self._connection.note_stop(command)
-        if name in STOPS:
-            return await self._connection.stop(self.user, name, payload, REPLY_WITHIN)
+        if command.stops:
+            return await self._stop(command, payload)
         within = {Command.HOME: HOME_WITHIN, Command.ENABLE: ENABLE_WITHIN}.get(command, REPLY_WITHIN)
         before = began if command.starts else math.inf
         reply = await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
@@ -614,7 +612,20 @@ class AsyncRobot:
         for overtaking in self._connection.later_stops(before) & STOPS:
             with contextlib.suppress(ServiceError):  # the connection is closed
                 self._connection.query_unanswered(("cmd", self.user, overtaking), None)
+        if command is Command.RESUME:
+            self._connection.forget_stop(Command.PAUSE)
         return reply
+
+    async def _stop(self, command: Command, payload: bytes | None) -> CommandReply:
+        """Send a command that stops the robot. What the client was called for earlier is not sent afterwards."""
+        noted = self._connection.note_stop(command) if stops_everything(command, payload) else -math.inf
+        try:
+            if command in STOPS:
+                return await self._connection.stop(self.user, command, payload, REPLY_WITHIN)
+            return await self._connection.fetch(("cmd", self.user, command), CommandReply, payload)
+        except RefusedError:
+            self._connection.forget_stop(command, noted)
+            raise
 
     async def info(self) -> Info:
         """Return the robot's geometry, limits, rates and versions."""

@@ -119,9 +119,13 @@ class AsyncConnection:
                 raise await self.nobody("cmd", user, name) from error
         return reply
 
-    def note_stop(self, name: Command) -> None:
-        """Store the time of the present call, which stops the robot."""
-        self._connection.note_stop(name)
+    def note_stop(self, name: Command) -> float:
+        """Store the time of the present call, which stops the robot; return that time [s]."""
+        return self._connection.note_stop(name)
+
+    def forget_stop(self, name: Command, at: float = math.inf) -> None:
+        """Forget a stop that was called at the time `at` [s] or earlier, because it was refused or taken back."""
+        self._connection.forget_stop(name, at)
 
     def later_stops(self, began: float) -> set[Command]:
         """Return the commands that stop the robot and were called later than `began` [s]."""

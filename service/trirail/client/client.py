@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Generator, Iterator, Sequence
 from html import escape
 from pathlib import Path
@@ -19,7 +20,7 @@ import zenoh
 
 from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import GoalHandle, Jog, Lease, LoopThread, Track, callback
-from trirail.client.call_time import called
+from trirail.client.call_time import called, called_at
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.client.trajectory import Points, points_of
 from trirail.errors import TrirailError
@@ -49,7 +50,8 @@ def _call(
 
     @functools.wraps(method)
     def call(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return robot._loop.call(method(robot._robot, *args, **kwargs))
+        with called(time.monotonic()):  # also in a signal handler, which interrupts another call
+            return robot._loop.call(method(robot._robot, *args, **kwargs))
 
     return call
 
@@ -64,7 +66,8 @@ def _stop(
 
     @functools.wraps(method)
     def call(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return robot._stop_loop.call(method(robot._stopping, *args, **kwargs))
+        with called(time.monotonic()):
+            return robot._stop_loop.call(method(robot._stopping, *args, **kwargs))
 
     return call
 
@@ -282,9 +285,9 @@ class Robot:
             "marks": marks,
             "stop_at": stop_at,
         }
-        with called():
-            rows = points_of(points)  # in the caller's thread, since the caller's iterator may call this robot
-            return self._send(lambda: self._robot.follow(rows, **how, id=id))
+        began = called_at()
+        rows = points_of(points)  # in the caller's thread, since the caller's iterator may call this robot
+        return self._send(lambda: self._robot.follow(rows, **how, id=id), began)
 
     # ------------------------------------------------------------------ what the service tells
 
@@ -302,12 +305,16 @@ class Robot:
 
     # ------------------------------------------------------------------ inside
 
-    def _send(self, send: Callable[[], Coroutine[Any, Any, AsyncGoalHandle]]) -> GoalHandle:
-        """Send a goal and return its handle. If an exception such as Ctrl-C interrupts the call, stop the goal."""
+    def _send(self, send: Callable[[], Coroutine[Any, Any, AsyncGoalHandle]], began: float | None = None) -> GoalHandle:
+        """Send a goal and return its handle. If an exception such as Ctrl-C interrupts the call, stop the goal.
+
+        `began` is the time at which the program called for the goal [s]; None for the present time.
+        """
         sent: list[AsyncGoalHandle] = []
 
         async def handle() -> GoalHandle:
-            sent.append(await send())
+            with called(began):
+                sent.append(await send())
             return GoalHandle(sent[0], self._loop, self.command)
 
         async def stop() -> None:

@@ -158,9 +158,16 @@ class Connection:
             if at_door is not None:
                 at_door.cancel()
 
-    def note_stop(self, name: Command) -> None:
-        """Store the time of the present call, which stops the robot."""
-        self._stopped_at[name] = max(self._stopped_at[name], called_at())
+    def note_stop(self, name: Command) -> float:
+        """Store the time of the present call, which stops the robot; return that time [s]."""
+        at = called_at()
+        self._stopped_at[name] = max(self._stopped_at[name], at)
+        return at
+
+    def forget_stop(self, name: Command, at: float = math.inf) -> None:
+        """Forget a stop that was called at the time `at` [s] or earlier, because it was refused or taken back."""
+        if self._stopped_at[name] <= at:
+            self._stopped_at[name] = -math.inf
 
     def later_stops(self, began: float) -> set[Command]:
         """Return the commands that stop the robot and were called later than `began` [s]."""
