@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import select
+import termios
 import threading
 import tty
 from collections.abc import Callable, Iterator
@@ -46,6 +47,37 @@ def test_whatever_is_typed_is_keys(typed: bytes) -> None:
     assert all(keys(typed))
 
 
+@pytest.fixture
+def tty_pair(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
+    """A keyboard, and the terminal of the pendant."""
+    keyboard, terminal = pty.openpty()
+    tty.setcbreak(terminal)
+    stream = SimpleNamespace(fileno=lambda: terminal)
+    monkeypatch.setattr(pendant, "sys", SimpleNamespace(stdin=stream, stdout=stream))
+    yield keyboard, terminal
+    os.close(keyboard)
+    os.close(terminal)
+
+
+class Hand:
+    """Stands in for the pendant: it notes the keys, and q ends it."""
+
+    def __init__(self) -> None:
+        self.pressed: list[str] = []
+        self.over = self.released = False
+        self.speed, self.said = TOP, ""
+
+    def press(self, key: str, _now: float) -> None:
+        self.pressed.append(key)
+        self.over = self.over or key == "q"
+
+    def release_key(self) -> None:
+        self.released = True
+
+    def tick(self, _now: float) -> None:
+        """Do nothing: no key is held."""
+
+
 @pytest.mark.parametrize(
     ("typed", "found"),
     [
@@ -56,14 +88,10 @@ def test_whatever_is_typed_is_keys(typed: bytes) -> None:
     ],
 )
 def test_a_key_that_a_serial_line_sends_byte_by_byte_is_the_same_key(
-    typed: bytes, found: list[str], monkeypatch: pytest.MonkeyPatch
+    typed: bytes, found: list[str], tty_pair: tuple[int, int]
 ) -> None:
-    keyboard, terminal = pty.openpty()
-    tty.setcbreak(terminal)
-    monkeypatch.setattr(pendant, "sys", SimpleNamespace(stdin=SimpleNamespace(fileno=lambda: terminal)))
-    pressed: list[str] = []
-    hand = SimpleNamespace(over=False, press=lambda key, _: pressed.append(key), tick=lambda _: None)
-    hand.speed, hand.said = TOP, ""
+    keyboard, terminal = tty_pair
+    hand = Hand()
     shown = SimpleNamespace(update=lambda *_, **__: None)
     serving = threading.Thread(target=pendant._serve, args=(hand, SimpleNamespace(state=None), shown))
     serving.start()
@@ -71,13 +99,65 @@ def test_a_key_that_a_serial_line_sends_byte_by_byte_is_the_same_key(
         for byte in typed:
             os.write(keyboard, bytes([byte]))
             wait_until(lambda: not select.select([terminal], [], [], 0.0)[0])
-        wait_until(lambda: len(pressed) >= len(found))
+        wait_until(lambda: len(hand.pressed) >= len(found))
     finally:
         hand.over = True
         serving.join()
-        os.close(keyboard)
-        os.close(terminal)
-    assert pressed == found
+    assert hand.pressed == found
+
+
+def test_keys_typed_during_a_stall_are_stale_but_a_stop_is_not(
+    tty_pair: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.write(tty_pair[0], b"a+\x1b[C \x1b[Aq")
+    passes = iter((0.0, 2.0 * pendant.STALL_S))
+    monkeypatch.setattr(pendant, "time", SimpleNamespace(monotonic=lambda: next(passes)))
+    hand = Hand()
+    pendant._serve(hand, SimpleNamespace(state=None), SimpleNamespace(update=lambda *_, **__: None))  # type: ignore[arg-type]
+    assert hand.pressed == [" ", "q"]
+    assert hand.released
+
+
+def test_keys_work_while_the_output_is_suspended(tty_pair: tuple[int, int]) -> None:
+    """By Scroll Lock of a console: what is written then waits."""
+    keyboard, terminal = tty_pair
+    termios.tcflow(terminal, termios.TCOOFF)
+    drawings: list[object] = []
+    hand, shown = Hand(), SimpleNamespace(update=lambda text, **_: drawings.append(text))
+    os.write(keyboard, b" q")
+    pendant._serve(hand, SimpleNamespace(state=None), shown)  # type: ignore[arg-type]
+    assert (hand.pressed, drawings) == ([" ", "q"], [])
+    termios.tcflow(terminal, termios.TCOON)
+    hand.over = False
+    os.write(keyboard, b"q")
+    pendant._serve(hand, SimpleNamespace(state=None), shown)  # type: ignore[arg-type]
+    assert drawings
+
+
+def test_ctrl_s_does_not_suspend_the_output(tty_pair: tuple[int, int], operator: Operator) -> None:
+    before = termios.tcgetattr(tty_pair[1])
+    assert before[0] & termios.IXON
+    with pendant._raw(operator.pendant):
+        assert not termios.tcgetattr(tty_pair[1])[0] & termios.IXON
+    assert termios.tcgetattr(tty_pair[1]) == before
+
+
+def test_the_message_of_a_stop_goes_when_the_robot_moves_again(tty_pair: tuple[int, int]) -> None:
+    robot = FakeRobot()
+    modes, drawn = iter(("moving", "holding", "moving", "moving")), list[str]()
+    hand, newest = Hand(), SimpleNamespace(state=None)
+
+    def draw(*_: object, **__: object) -> None:
+        drawn.append(hand.said)
+        if (mode := next(modes, None)) is None:
+            hand.over = True
+            return
+        if newest.state is not None and newest.state.mode == "moving" != mode:
+            hand.said = pendant.STOPPED  # before the state of the stopped robot has arrived
+        newest.state = msgspec.structs.replace(robot.state(), mode=mode)
+
+    pendant._serve(hand, newest, SimpleNamespace(update=draw))  # type: ignore[arg-type]
+    assert drawn == ["", "", pendant.STOPPED, pendant.HELP, pendant.HELP]
 
 
 @pytest.mark.parametrize("show", [pendant.run, lambda robot: picture.html(robot.told, robot.state())])
@@ -165,7 +245,7 @@ def test_another_key_ends_what_is_held(operator: Operator) -> None:
 def test_space_and_escape_stop_also_what_others_have_begun(operator: Operator, key: str) -> None:
     operator.press(key)
     wait_until(lambda: "stop" in operator.robot.commands)
-    wait_until(lambda: operator.pendant.said == "stopped")
+    wait_until(lambda: operator.pendant.said == pendant.STOPPED)
 
 
 def test_the_speed_goes_up_and_down_within_its_bounds(operator: Operator) -> None:

@@ -28,6 +28,7 @@ from trirail.errors import ServiceError, TrirailError
 from trirail.wire.goals import Tool
 from trirail.wire.state import State
 from trirail.wire.text import printable
+from trirail.wire.vocabulary import Mode
 
 _ARROWS = {"A": "up", "B": "down", "C": "right", "D": "left"}
 # An arrow key is sent as ESC [ A, in application mode as ESC O A, and with modifiers as ESC [ 1 ; 2 A.
@@ -63,12 +64,16 @@ held key every 30 to 50 ms, after a pause before the first repeat."""
 REDRAW_S = 0.1
 """Interval at which the display is redrawn [s]."""
 STALL_S = 0.5
-"""Length of a pause in this program after which buffered keys are discarded as stale [s]."""
+"""Length of a pause in this program after which buffered keys are stale [s]. A stop is never stale."""
+MAX_BUFFERED = 4096
+"""Maximum number of bytes that the kernel buffers for a terminal."""
 STATE_TIMEOUT_S = 1.0
 """Minimum time without a state after which the service counts as silent [s]."""
 AXES = {"right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0), "a": (0, 0, 1), "d": (0, 0, -1)}
 """Directions along x, y and φ."""
 HELP = "← → x   ↑ ↓ y   a d φ   + − speed   Space stop   q leave"
+STOP_KEYS = (" ", "escape")
+STOPPED = "stopped"
 
 
 class Pendant:
@@ -101,7 +106,7 @@ class Pendant:
             self.hold(AXES[key], now)
             return
         self.release_key()
-        if key in (" ", "escape"):
+        if key in STOP_KEYS:
             threading.Thread(target=self._stop, name="stop", daemon=True).start()
         elif key in "+-":
             self._choice = min(max(self._choice + (1 if key == "+" else -1), 0), len(SPEEDS) - 1)
@@ -132,7 +137,7 @@ class Pendant:
     def _stop(self) -> None:
         try:
             self._robot.stop()
-            self._set_message("stopped")
+            self._set_message(STOPPED)
         except TrirailError as error:
             self._set_message(str(error))
 
@@ -197,26 +202,30 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
 def _serve(pendant: Pendant, newest: _StateReader, display: Live) -> None:
     descriptor = sys.stdin.fileno()
     drawn, last = -math.inf, time.monotonic()
-    begun = b""
+    begun, mode = b"", None
     while not pendant.over:
         ready, _, _ = select.select([descriptor], [], [], KEY_TIMEOUT_S / 5.0)
         now = time.monotonic()
-        if now - last > STALL_S:  # stopped and continued: the buffered keys are stale
+        stalled = now - last > STALL_S  # stopped and continued
+        if stalled:
             pendant.release_key()
-            termios.tcflush(descriptor, termios.TCIFLUSH)
-            begun = b""
-        else:
-            typed, begun = begun, b""  # if nothing follows, this is the key Escape
-            if descriptor in ready:
-                if not (more := os.read(descriptor, 1024)):
-                    return  # the terminal is gone
-                typed, begun = split(typed + more)
-            for key in keys(typed):
+        typed, begun = begun, b""  # if nothing follows, this is the key Escape
+        if descriptor in ready:
+            if not (more := os.read(descriptor, MAX_BUFFERED)):
+                return  # the terminal is gone
+            typed, begun = split(typed + more)
+        for key in keys(typed):
+            if not stalled or key in (*STOP_KEYS, "q"):
                 pendant.press(key, now)
         pendant.tick(now)
         last = now
-        if now - drawn > REDRAW_S:
-            display.update(_shown(pendant, newest.state), refresh=True)
+        # Scroll Lock of a console suspends the output, in which writing would wait.
+        if now - drawn > REDRAW_S and select.select([], [sys.stdout], [], 0.0)[1]:
+            state, before = newest.state, mode
+            mode = None if state is None else state.mode
+            if mode == Mode.MOVING != before and pendant.said == STOPPED:
+                pendant.said = HELP
+            display.update(_shown(pendant, state), refresh=True)
             drawn = now
 
 
@@ -237,6 +246,13 @@ class _TerminalClosed(Exception):
     """The terminal was closed, or the program was asked to exit."""
 
 
+def _read_single_keys(descriptor: int) -> None:
+    tty.setcbreak(descriptor, termios.TCSAFLUSH)
+    attributes = termios.tcgetattr(descriptor)
+    attributes[0] &= ~termios.IXON  # Ctrl-S would suspend the output
+    termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
+
+
 @contextmanager
 def _raw(pendant: Pendant) -> Iterator[None]:
     """Switch the terminal to unbuffered input without echo.
@@ -255,11 +271,11 @@ def _raw(pendant: Pendant) -> Iterator[None]:
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)  # stops here until SIGCONT
         signal.signal(number, suspended)
-        tty.setcbreak(descriptor, termios.TCSAFLUSH)
+        _read_single_keys(descriptor)
 
     handlers = {signal.SIGHUP: hung_up, signal.SIGTERM: hung_up, signal.SIGTSTP: suspended}
     earlier = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    tty.setcbreak(descriptor, termios.TCSAFLUSH)
+    _read_single_keys(descriptor)
     try:
         yield
     finally:
