@@ -174,6 +174,7 @@ def _driven(recording: Path, quiet: bool) -> dict[str, Driven]:
     """Let a service follow the motions, and print its progress unless `quiet`; return the motions by name."""
     try:
         recording.parent.mkdir(parents=True, exist_ok=True)
+        recording.unlink(missing_ok=True)  # it is replaced, as the pictures are
     except OSError as error:
         raise ServiceError(f"cannot write pictures to {recording.parent}: {error.strerror}") from error
     say = (lambda _: None) if quiet else (lambda words: print(words, file=sys.stderr))

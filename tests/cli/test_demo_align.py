@@ -7,8 +7,18 @@ import patient
 import pytest
 from rerun.chunk import RrdReader
 from trirail.cli import demo_align
+from trirail.cli.config_commands import shipped_file
+from trirail.errors import ServiceError
 
 pytestmark = pytest.mark.slow
+
+
+def test_pictures_that_exist_are_kept(tmp_path: Path) -> None:
+    pictures = tmp_path / "align-pictures.rrd"
+    pictures.write_bytes(b"RRF2")
+    with pytest.raises(ServiceError, match=r"align-pictures\.rrd already exists"):
+        demo_align.run(shipped_file("uvw"), tmp_path / "align.rrd")
+    assert pictures.read_bytes() == b"RRF2"
 
 
 def test_parts_are_laid_right_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

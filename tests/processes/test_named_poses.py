@@ -37,10 +37,10 @@ class Place(NamedTuple):
 
     @contextlib.contextmanager
     def service(self, number: int = signal.SIGTERM) -> Iterator[own_service.Process]:
+        recording = self.config.with_suffix(".rrd")
+        recording.unlink(missing_ok=True)  # of the service before
         with (self.config.parent / "service.log").open("ab") as log:
-            process = own_service.start(
-                self.config, log, "--record", str(self.config.with_suffix(".rrd")), STATE_DIRECTORY=str(self.state)
-            )
+            process = own_service.start(self.config, log, "--record", str(recording), STATE_DIRECTORY=str(self.state))
         try:
             yield process
         finally:

@@ -981,6 +981,7 @@ def test_a_start_that_fails_says_why_in_one_line(
     assert failed.returncode == 1
     assert len(failed.stderr.splitlines()) == 1, failed.stderr
     assert any(part in failed.stderr for part in ([said] if isinstance(said, str) else said))
+    assert not (tmp_path / "r.rrd").exists()
 
 
 def test_nobody_there(tmp_path: Path) -> None:

@@ -59,7 +59,8 @@ def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Litera
     Parameters
     ----------
     record
-        Recording file to write. By default, the file is in the configured folder and is named after the time.
+        Recording file to write, which must not exist yet. By default, the file is in the configured folder and is named
+        after the time.
     log
         Format of the log: text for people, or JSON. By default, [telemetry] log selects it.
     """
@@ -111,7 +112,7 @@ def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: P
     stay
         Keep the service and its live view running afterwards, until Ctrl-C.
     record
-        Recording file to keep.
+        Recording file to write, which must not exist yet.
     """
     from trirail.cli import demo as shown
 

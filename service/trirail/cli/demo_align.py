@@ -27,6 +27,7 @@ from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.client.stage_as_built import StageAsBuilt, built_otherwise
 from trirail.config import corrected_geometry, load
+from trirail.errors import ServiceError
 
 PART_COUNT = 5
 MAX_OFFSET_M, MAX_ROTATION = 0.4e-3, math.radians(0.25)
@@ -90,11 +91,13 @@ class DrawnCameras:
 def run(file: Path, recording: Path, parts: int = PART_COUNT, seed: int = 0) -> int:
     """Calibrate the cameras, then align `parts` parts; return 0 if all succeeded.
 
-    Pictures are written to `recording` and shown in the live view.
+    Pictures are written to a file next to `recording`, and shown in the live view. Raises ServiceError if it exists.
     """
     config = load(file)
     recording.parent.mkdir(parents=True, exist_ok=True)
     pictures = recording.with_name(f"{recording.stem}-pictures.rrd")
+    if pictures.exists():
+        raise ServiceError(f"{pictures} already exists; name another file, or remove it")
     out.print(f"[bold]trirail demo align[/]: starting the service on {plain(file.name)}", soft_wrap=True)
     built = built_otherwise(corrected_geometry(config), np.random.default_rng(seed), BUILT_OFF, BUILT_TURNED)
     stage, results = StageAsBuilt(built, (PLAY, PLAY, PLAY)), []

@@ -25,7 +25,7 @@ from trirail.telemetry.contents import Contents
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.journal import EVENTS, REQUESTS
 from trirail.telemetry.readout import ReadoutState
-from trirail.telemetry.retention import MAGIC, STAMP, name_in_order
+from trirail.telemetry.retention import STAMP, name_in_order
 from trirail.telemetry.rotation import RotatedFiles, claim
 from trirail.telemetry.sinks import RESERVE, Relay, free_space, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
@@ -72,7 +72,7 @@ class Recorder:
         Folder of the files `<robot>-<date>-<time>.rrd`; rotated files also have `-part2` and so on in their names. If
         the clock is behind the newest recording in the folder, the date is that of the next second after it.
     path
-        File to write, instead of a new file in `directory`.
+        File to write, instead of a new file in `directory`. A file that exists must be empty.
     name, reason
         Name of a black box, and the fault for which it is saved. A black box has only one file, and may fill the disk.
     sidecars
@@ -87,7 +87,7 @@ class Recorder:
     Raises
     ------
     ServiceError
-        The file cannot be written, or the live port is in use.
+        The file exists, or cannot be written, or the live port is in use.
     FileError
         `path` is not a regular file.
     """
@@ -119,9 +119,9 @@ class Recorder:
         self._warn = warn or (lambda text: streams.log("warning", text.text))
         server = live_server(telemetry.live_port, telemetry.live_mb) if live and telemetry.live_port else None
         try:
-            first = claim(directory, session) if path is None else _overwrite(path)
             channel = config.can.channel or config.can.interface
             captured = config.telemetry.capture_can and not self._is_black_box
+            first = claim(directory, session) if path is None else _create(path, log=captured)
             log = first.with_suffix(".log")
             self._frames = CandumpLog(log, channel, self._warn) if captured else None
         except OSError as error:
@@ -270,7 +270,7 @@ class Recorder:
         self._unwritten.clear()
 
     def close(self) -> None:
-        """Write the remaining data and finish the file. Delete a file of `directory` that has no cycle.
+        """Write the remaining data and finish the file. Delete a file that has no cycle, unless it is a black box.
 
         If the disk or a viewer does not respond, this method waits for at most a few seconds.
         """
@@ -281,9 +281,13 @@ class Recorder:
         self._files.close()
         if self._frames:
             self._frames.close()
-        if self._last is None and self._own_folder is not None:  # the service could not start
+        if self._last is None and not self._is_black_box:  # the service could not start
             with contextlib.suppress(OSError):
-                retention.delete(self.path)
+                self.path.unlink(missing_ok=True)
+                if self._frames:
+                    self.path.with_suffix(".log").unlink(missing_ok=True)
+                if self._sidecars:
+                    retention.sidecar(self.path).unlink(missing_ok=True)
         else:
             self._write_sidecar()
         if self._live:
@@ -437,20 +441,19 @@ def _remedy(error: OSError) -> str:
     return "set telemetry.directory to a folder that can be written"
 
 
-def _overwrite(path: Path) -> Path:
-    """Create an empty file, or truncate an existing recording.
+def _create(path: Path, *, log: bool) -> Path:
+    """Create an empty file and, if `log`, one for the log of CAN frames; empty files are used as they are.
 
-    Raises FileError if the file is not a regular file (opening a FIFO would wait for a reader), and ServiceError if a
-    recorder is writing the file, or if it is not a recording.
+    Raises FileError if a file is not a regular file (opening a FIFO would wait for a reader), and ServiceError if a
+    recorder is writing the file, or if it is not empty.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with contextlib.suppress(FileNotFoundError):
-        files.check(path)
-        if retention.is_being_written(path):
-            raise ServiceError(f"{path} is being written, perhaps by another service; name another file")
-        with path.open("rb") as file:
-            # A power failure can leave a recording empty or full of zeros.
-            if not MAGIC.startswith(file.read(len(MAGIC)).rstrip(b"\0")):
-                raise ServiceError(f"{path} already exists and is not a recording; name another file")
-    path.open("wb").close()
+    for each in (path.with_suffix(".log"), path) if log else (path,):
+        with contextlib.suppress(FileNotFoundError):
+            files.check(each)
+            if retention.is_being_written(each):
+                raise ServiceError(f"{each} is being written, perhaps by another service; name another file")
+            if each.stat().st_size:
+                raise ServiceError(f"{each} already exists; name another file, or remove it")
+        each.open("ab").close()
     return path
