@@ -31,6 +31,7 @@ from trirail.client.client import Robot
 from trirail.config import SIM
 from trirail.errors import TrirailError
 from trirail_drivers.interface import Triple
+from waiting import wait_until
 
 WITHIN = 60.0
 MARKS = """
@@ -130,6 +131,30 @@ def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(
 
     with pytest.raises(TrirailError, match=words):
         look()
+
+
+@pytest.mark.parametrize("answers", [0, 1])
+def test_a_line_that_no_look_asked_for_is_no_answer_to_a_later_one(answers: int, tmp_path: Path) -> None:
+    go, ready, script = tmp_path / "go", tmp_path / "ready", tmp_path / "marks.sh"
+    answer = """echo '{"a": [0, 0]}'"""
+    until_go = f"until [ -e {go} ]; do sleep 0.01; done"
+    script.write_text(f"{f'read look; {answer};' * answers} {until_go}; {answer}; touch {ready}; read look; {answer}")
+    with mark_source.program(f"sh {script}") as (look, _):
+        for _ in range(answers):
+            look()
+        go.touch()
+        wait_until(ready.exists)
+        with pytest.raises(TrirailError, match="without being asked"):
+            look()
+
+
+def test_all_processes_of_a_program_end_with_it(tmp_path: Path) -> None:
+    script = tmp_path / "marks.sh"
+    script.write_text("sleep 300 & while read look; do echo '{\"a\": [0, '$!']}'; done")
+    with mark_source.program(f"sh {script}") as (look, _):
+        child = int(look()["a"][1])
+        os.kill(child, 0)
+    wait_until(lambda: not Path(f"/proc/{child}").exists() or " Z " in Path(f"/proc/{child}/stat").read_text())
 
 
 def test_marks_of_pictures_are_of_those_that_were_written_since_they_were_asked_for(tmp_path: Path) -> None:

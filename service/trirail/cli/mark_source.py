@@ -8,6 +8,7 @@ import math
 import os
 import select
 import shlex
+import signal
 import subprocess
 import time
 from collections import Counter
@@ -36,7 +37,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 PICTURE_TIMEOUT_S, WRITE_TIMEOUT_S, POLL_S = 30.0, 1.0, 0.02
 """Maximum wait for a line or a newer picture, maximum time to write a picture, and polling interval [s]."""
 EXIT_TIMEOUT_S = 5.0
-"""Maximum time that a program may take to exit after SIGTERM [s]."""
+"""Maximum time that a program and its children may take to exit after SIGTERM [s]."""
 PIPE_BYTES = 65536
 """Maximum size of one read from a program [bytes]."""
 INSTALL = "pip install 'trirail[vision]'"
@@ -69,8 +70,8 @@ class Source(NamedTuple):
 def program(command: str) -> Iterator[Source]:
     """Run a program that prints a line of JSON, {"mark": [u, v], …} [pixel], for each line that it reads.
 
-    Raises TrirailError if the program cannot be run, exits, prints anything else, or prints nothing within
-    PICTURE_TIMEOUT_S.
+    Raises TrirailError if the program cannot be run, exits, prints anything else, also if it was not asked, or prints
+    nothing within PICTURE_TIMEOUT_S.
     """
     try:
         # The program gets its own process group: Ctrl-C goes to trirail, which ends the program.
@@ -82,6 +83,11 @@ def program(command: str) -> Iterator[Source]:
         ) from error
 
     def find_marks() -> Marks:
+        if select.select([stdout], [], [], 0.0)[0] and (early := os.read(stdout.fileno(), PIPE_BYTES)):
+            raise TrirailError(  # each later look would get the answer to the look before, from before the motion
+                f"{command!r} printed {_excerpt(early)!r} without being asked; expected one line for each line that it "
+                "reads"
+            )
         with contextlib.suppress(BrokenPipeError):  # it has exited; its last line may still be in the pipe
             stdin.write(b"look\n")
             stdin.flush()
@@ -103,21 +109,33 @@ def program(command: str) -> Iterator[Source]:
             marks: Marks = decoded(line, LINE)
         except (msgspec.MsgspecError, ValueError) as error:
             wanted = 'expected {"mark": [u, v], …} in pixels'
-            printed = line.decode(errors="replace").strip()[:80]
-            raise TrirailError(f"{command!r} printed {printed!r}: {error}; {wanted}") from error
+            raise TrirailError(f"{command!r} printed {_excerpt(line)!r}: {error}; {wanted}") from error
         return marks
 
     try:
         yield Source(find_marks)
     finally:
-        process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(EXIT_TIMEOUT_S)
-        process.kill()
-        process.wait()
+        _end_group(process)
         for pipe in (stdin, stdout):
             with contextlib.suppress(OSError):  # unsent data is of no use any more
                 pipe.close()
+
+
+def _excerpt(printed: bytes) -> str:
+    return printed.decode(errors="replace").strip()[:80]
+
+
+def _end_group(process: subprocess.Popen[bytes]) -> None:
+    """End a process and its children, which could keep a camera open."""
+    with contextlib.suppress(ProcessLookupError):  # the group has no process any more
+        os.killpg(process.pid, signal.SIGTERM)
+        deadline = time.monotonic() + EXIT_TIMEOUT_S
+        while time.monotonic() < deadline:
+            process.poll()
+            os.killpg(process.pid, 0)
+            time.sleep(POLL_S)
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 @contextlib.contextmanager
