@@ -219,6 +219,16 @@ def test_a_folder_that_cannot_be_read_is_not_an_empty_one(
     assert run("sessions", str(tmp_path)) == (1, "", f"trirail: {tmp_path}: Permission denied\n")
 
 
+@pytest.mark.parametrize("columns", thinned(["0", "1"]))
+@pytest.mark.parametrize(("line", "said"), [("fk 0 0 0", "φ"), ("fk 9 9 9", "out of reach"), ("fk --help", "Usage")])
+def test_every_command_speaks_if_the_terminal_is_said_to_have_no_columns(line: str, said: str, columns: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "trirail", *line.split()], capture_output=True, text=True,
+        env=os.environ | {"COLUMNS": columns, "LINES": columns}, check=False, timeout=WITHIN,
+    )  # fmt: skip
+    assert said in done.stdout + done.stderr
+
+
 @pytest.mark.parametrize("line", ["fk 0 0 0", "fk 0 0 0 --json", "fk 9 9 9 --json", "help all"])
 @pytest.mark.parametrize("unbuffered", thinned(["", "1"]))
 def test_output_to_a_full_disk_is_an_error_in_one_line(line: str, unbuffered: str) -> None:

@@ -63,6 +63,12 @@ def end_with_reader(items: Iterable[T]) -> Iterator[T]:
             raise BrokenPipeError
 
 
+MIN_WIDTH, MIN_HEIGHT = 20, 2
+"""Minimum size of a terminal that COLUMNS and LINES may give [characters]. Rich prints nothing if COLUMNS is 0."""
+for variable, least in (("COLUMNS", MIN_WIDTH), ("LINES", MIN_HEIGHT)):
+    if (number := os.environ.get(variable, "")).isdecimal() and int(number) < least:
+        del os.environ[variable]
+
 out = _CommandConsole(highlight=False, emoji=False)
 err = _CommandConsole(stderr=True, highlight=False, emoji=False)
 
