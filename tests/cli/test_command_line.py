@@ -229,7 +229,7 @@ def test_every_command_speaks_if_the_terminal_is_said_to_have_no_columns(line: s
     assert said in done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("line", ["fk 0 0 0", "fk 0 0 0 --json", "fk 9 9 9 --json", "help all"])
+@pytest.mark.parametrize("line", ["fk 0 0 0", "fk 0 0 0 --json", "fk 9 9 9 --json", "help all", "completion bash"])
 @pytest.mark.parametrize("unbuffered", thinned(["", "1"]))
 def test_output_to_a_full_disk_is_an_error_in_one_line(line: str, unbuffered: str) -> None:
     with open("/dev/full", "w") as full:
@@ -238,7 +238,8 @@ def test_output_to_a_full_disk_is_an_error_in_one_line(line: str, unbuffered: st
             env=os.environ | {"PYTHONUNBUFFERED": unbuffered}, check=False,
         )  # fmt: skip
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert ("out of reach" if " 9 " in line else "No space left on device") in done.stderr
+    told = "out of reach" if " 9 " in line else "trirail: standard output: No space left on device"
+    assert told in done.stderr
 
 
 @pytest.mark.long

@@ -350,8 +350,9 @@ def _print_system_error(error: OSError, words: list[str]) -> None:
         sys.stdout.flush()
     except OSError:
         terminal.discard(sys.stdout)
-        terminal.print_error(f"standard output: {reason}")
-        return
+        error.filename = terminal.OUTPUT
+    if error.filename == terminal.OUTPUT:
+        words = []  # JSON would not arrive
     is_named = isinstance(error.filename, str | bytes) and error.filename
     _print_failure(TrirailError(f"{os.fsdecode(error.filename)}: {reason}" if is_named else reason), words)
 

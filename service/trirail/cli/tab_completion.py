@@ -18,12 +18,13 @@ def script(app: App, shell: Shell | None, *, install: bool) -> int:
     from cyclopts.completion.detect import ShellDetectionError
 
     try:
-        if install:
-            terminal.print_line(f"installed: {app.install_completion(shell=shell)}; new shells complete trirail")
-        else:
-            terminal.write(app.generate_completion(shell=shell))
+        made = app.install_completion(shell=shell) if install else app.generate_completion(shell=shell)
     except ShellDetectionError as error:
         raise TrirailError("shell not recognised: use bash, zsh or fish") from error
     except (OSError, RuntimeError) as error:  # a user without a home cannot be asked for a folder
         raise TrirailError(f"cannot install: {error}") from error
+    if install:
+        terminal.print_line(f"installed: {made}; new shells complete trirail")
+    else:
+        terminal.write(str(made))
     return 0

@@ -46,8 +46,26 @@ def discard(stream: IO[str]) -> None:
         os.close(null)
 
 
+OUTPUT = "standard output"
+"""Name of the stream in errors."""
+
+
+@contextlib.contextmanager
+def _named_errors(stream: str) -> Iterator[None]:
+    """Give an error of writing, such as that of a full disk, the name of the stream."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = stream
+        raise
+
+
 class _CommandConsole(Console):
     """Console of a command, which continues to its own exit code if the reader of its output, such as head, leaves."""
+
+    def __exit__(self, *exception: Any) -> None:
+        with _named_errors("standard error" if self.stderr else OUTPUT):
+            super().__exit__(*exception)
 
     def on_broken_pipe(self) -> None:
         """Discard the output, whereas Rich would exit with code 1."""
@@ -135,8 +153,9 @@ def print_error(words: str) -> None:
 def write(text: str) -> None:
     """Write text to standard output as it is, and flush the output."""
     try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
+        with _named_errors(OUTPUT):
+            sys.stdout.write(text)
+            sys.stdout.flush()
     except BrokenPipeError:
         out.on_broken_pipe()
 
