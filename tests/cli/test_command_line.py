@@ -7,6 +7,7 @@ import io
 import itertools
 import json
 import os
+import queue
 import shlex
 import shutil
 import signal
@@ -787,6 +788,17 @@ def test_a_stop_that_fails_waits_for_the_session_that_opens(
     with pytest.raises(type(failure)):
         stop_commands.stopping(Command.STOP)()
     assert not opening.is_alive()
+
+
+def test_a_stop_without_an_answer_says_that_it_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: queue.SimpleQueue[str] = queue.SimpleQueue()
+    asked = SimpleNamespace(opening=threading.Thread(), wait=lambda: said.get(timeout=WITHIN))
+    monkeypatch.setattr(new_stop, "NewStop", lambda *_: asked)
+    monkeypatch.setattr(stop_commands, "ANSWER_S", 0.0)
+    monkeypatch.setattr(stop_commands, "confirmed", lambda *_: said.put(str(_[-1])))
+    monkeypatch.setattr(terminal, "print_error", said.put)
+    assert stop_commands.stopping(Command.STOP)() == 0
+    assert "no answer" in said.get()
 
 
 def test_what_a_command_opens_never_has_the_number_of_a_closed_standard_stream() -> None:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
-from threading import Thread
+from threading import Thread, Timer
 
+from trirail.cli import terminal
 from trirail.cli.options import HERE, Service
 from trirail.cli.robot_commands import confirmed
 from trirail.wire.vocabulary import Command
+
+ANSWER_S = 5.0
+"""Time without an answer after which a message says that the command still waits [s]. A refusal takes up to 3 s."""
 
 
 def stopping(name: Command) -> Callable[..., int]:
@@ -19,10 +23,17 @@ def stopping(name: Command) -> Callable[..., int]:
         from trirail.client.new_stop import NewStop
 
         asked = NewStop(name, service.robot, service.connect, service.tls)
+        words = f"{name}: no answer from {service.connect} yet; still trying, Ctrl-C gives up"
+        silence = Timer(ANSWER_S, terminal.print_error, (words,))
+        silence.daemon = True
+        silence.start()
         try:
-            confirmed(service, name, asked.wait())
+            reply = asked.wait()
+            silence.cancel()
+            confirmed(service, name, reply)
             sys.stdout.flush()
         except BaseException:
+            silence.cancel()
             _join(asked.opening)
             raise
         if asked.opening.is_alive():  # it may take seconds
