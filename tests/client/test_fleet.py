@@ -63,18 +63,20 @@ def test_who_needs_somebody_stands_first(hub: tuple[str, zenoh.Session]) -> None
                 service.put(f"trirail/{robot}/summary", content, encoding="application/json")
 
         said = {name: msgspec.json.encode(FAULT if name == "c" else OK) for name in "abcd"}
-        said |= {"odd": b"\xff nonsense", "later": b'{"mode": "holding"}'}
-        until(lambda: len(fleet.members()) == 4, lambda: publish(said))
-        assert [member.robot for member in fleet.members()] == ["c", "a", "b", "d"]
+        said |= {"odd": b"\xff nonsense", "later": b'{"mode": "holding"}'}  # of other versions
+        until(lambda: len(fleet.members()) == 6, lambda: publish(said))
+        assert [member.robot for member in fleet.members()] == ["c", "later", "odd", "a", "b", "d"]
         last = {"z": msgspec.json.encode(OK)}  # behind all that was said before
-        until(lambda: len(fleet.members()) == 5, lambda: publish(last))
+        until(lambda: len(fleet.members()) == 7, lambda: publish(last))
         now[0] += MAX_SILENCE_S - 0.5
-        again = {name: said[name] for name in "acd"} | last
-        until(lambda: sum(member.heard == now[0] for member in fleet.members()) == 4, lambda: publish(again))
+        again = {name: said[name] for name in ("a", "c", "d", "odd")} | last
+        until(lambda: sum(member.heard == now[0] for member in fleet.members()) == 5, lambda: publish(again))
         now[0] += 1.0
         assert [(member.robot, member.need(now[0])) for member in fleet.members()] == [
             ("b", Attention.SILENT),
+            ("later", Attention.SILENT),
             ("c", Attention.FAULT),
+            ("odd", Attention.UNREADABLE),
             *((name, Attention.NOTHING) for name in "adz"),
         ]
 
@@ -89,6 +91,7 @@ def test_one_look_as_json(
     def publish() -> None:
         while not ended.wait(0.05):
             service.put("trirail/demo/summary", msgspec.json.encode(FAULT), encoding="application/json")
+            service.put("trirail/later/summary", b'{"mode": "holding"}', encoding="application/json")
 
     publisher = threading.Thread(target=publish)
     publisher.start()
@@ -99,8 +102,10 @@ def test_one_look_as_json(
     finally:
         ended.set()
         publisher.join()
-    (robot,) = json.loads(capsys.readouterr().out)["robots"]
+    robot, later = json.loads(capsys.readouterr().out)["robots"]
     assert (robot["robot"], robot["need"], robot["fault"]) == ("demo", "fault", "drive B: EMCY 8700")
+    assert (later["robot"], later["need"], later["mode"]) == ("later", "unreadable", None)
+    assert later.keys() == robot.keys()
 
 
 def test_into_a_pipe_each_robot_is_a_line_whenever_it_has_changed(
@@ -115,20 +120,24 @@ def test_into_a_pipe_each_robot_is_a_line_whenever_it_has_changed(
         printing = threading.Thread(target=fleet_command._print_changes, args=(fleet, over))
         printing.start()
         try:
-            for number, summary in enumerate((OK, FAULT), 1):
+            for number, summary in enumerate((OK, FAULT, None), 1):
                 publish = partial(service.put, "trirail/demo/summary", msgspec.json.encode(summary))
                 until(lambda number=number: len(said) == number, publish)
         finally:
             over.set()
             printing.join()
-    assert [line.split("  ", 1)[1] for line in said] == ["demo  holding", "demo  fault  drive B: EMCY 8700"]
+    assert [line.split("  ", 1)[1] for line in said] == [
+        "demo  holding",
+        "demo  fault  drive B: EMCY 8700",
+        f"demo  {fleet_command.UNREADABLE}",
+    ]
 
 
 def test_the_table_says_what_each_needs_and_hides_what_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
     console = Console(width=150, force_terminal=False)
     monkeypatch.setattr(terminal, "out", console)
     now = time.monotonic()
-    members = [Member("a", OK, now - 60.0), Member("b", FAULT, now), Member("c", OK, now)]
+    members = [Member("a", OK, now - 60.0), Member("b", FAULT, now), Member("c", OK, now), Member("d", None, now)]
     with console.capture() as captured:
         console.print(fleet_command.table(members, now))
     lines = captured.get().splitlines()
@@ -136,4 +145,5 @@ def test_the_table_says_what_each_needs_and_hides_what_is_not_known(monkeypatch:
     assert "holding" not in lines[1]
     assert "drive B: EMCY 8700" in lines[2]
     assert "holding" in lines[3]
-    assert "3 robots, 2 need attention" in lines[-1]
+    assert fleet_command.UNREADABLE in lines[4]
+    assert "4 robots, 3 need attention" in lines[-1]

@@ -99,7 +99,7 @@ def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub
     with through(hub) as robot, Fleet(hub.locator, "demo") as fleet:
         robot.enable()
         assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
-        seen(fleet, lambda member, _: member.summary.mode == "holding", service)
+        seen(fleet, lambda member, _: member.summary is not None and member.summary.mode == "holding", service)
         robot.quick_stop()
         seen(fleet, lambda member, now: member.need(now) is Attention.FAULT, service)
         robot.reset()

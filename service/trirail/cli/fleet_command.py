@@ -14,6 +14,7 @@ from rich.table import Table
 
 from trirail.cli import terminal
 from trirail.cli.options import HERE, Service
+from trirail.wire.state import RobotSummary
 from trirail.wire.text import wall_clock
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 SNAPSHOT_S = 2.5
 """Time for which --json receives summaries [s]. Each robot sends at least one per second."""
+UNREADABLE = "another version of trirail, whose summary cannot be read here"
 REFRESH_S = 0.5
 """Interval at which the table is redrawn [s]."""
 
@@ -29,7 +31,8 @@ def fleet(*, service: Service = HERE) -> int:
     """Show all robots at --connect, usually a router, until Ctrl-C; those that need attention are first.
 
     A robot is silent if its loop has sent nothing for 3 s. If the output is a file or pipe, the command prints a line
-    whenever a robot changes. With --json, it prints once after 2.5 s; `lateness` is in µs.
+    whenever a robot changes. With --json, it prints once after 2.5 s; `lateness` is in µs, and the fields are null for
+    a robot of another version whose summary cannot be read.
     """
     never = threading.Event()
     from trirail.client.fleet import Fleet
@@ -70,12 +73,15 @@ def _line(member: Member, now: float) -> str:
     summary, need = member.summary, member.need(now)
     if need is Attention.SILENT:
         return f"{member.robot}  silent"
+    if summary is None:
+        return f"{member.robot}  {UNREADABLE}"
     words = (member.robot, summary.mode, summary.fault or "", f"goal {summary.goal}" if summary.goal else "")
     return "  ".join(filter(None, words))
 
 
 def _as_json(member: Member, now: float) -> dict[str, object]:
-    fields = msgspec.to_builtins(member.summary)
+    summary = member.summary
+    fields = dict.fromkeys(RobotSummary.__struct_fields__) if summary is None else msgspec.to_builtins(summary)
     return {"robot": member.robot, "need": member.need(now).name.lower(), **fields, "age": round(member.age(now), 2)}
 
 
@@ -88,9 +94,13 @@ def table(members: Sequence[Member], now: float) -> Table:
         summary, need = member.summary, member.need(now)
         needs = {
             Attention.SILENT: f"[bold red]silent for {member.age(now):.0f} s[/]",
-            Attention.FAULT: f"[bold red]{terminal.plain(summary.fault or 'reset')}[/]",
+            Attention.FAULT: f"[bold red]{terminal.plain((summary and summary.fault) or 'reset')}[/]",
+            Attention.UNREADABLE: f"[yellow]{UNREADABLE}[/]",
             Attention.NOTHING: "",
         }[need]
+        if summary is None:
+            drawn.add_row(terminal.plain(member.robot), "[dim]unknown[/]", needs)
+            continue
         mode = f"[{terminal.COLOURS.get(summary.mode, 'white')}]{terminal.plain(summary.mode)}[/]"
         drawn.add_row(
             terminal.plain(member.robot),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -28,25 +29,29 @@ class Attention(IntEnum):
 
     SILENT = 0
     FAULT = 1
-    NOTHING = 2
+    UNREADABLE = 2
+    NOTHING = 3
 
 
 class Member(NamedTuple):
     """Robot of the fleet with its newest summary."""
 
     robot: str
-    summary: RobotSummary
+    summary: RobotSummary | None
+    """None if it cannot be read, since the robot has another version."""
     heard: float
     """Arrival time of the summary, on this machine's monotonic clock [s]."""
 
     def age(self, now: float) -> float:
         """Return the age of the newest data of the robot's loop [s]."""
-        return now - self.heard + self.summary.age
+        return now - self.heard + (0.0 if self.summary is None else self.summary.age)
 
     def need(self, now: float) -> Attention:
         """Return the reason why the robot needs attention."""
         if self.age(now) > MAX_SILENCE_S:
             return Attention.SILENT
+        if self.summary is None:
+            return Attention.UNREADABLE
         return Attention.FAULT if self.summary.mode == Mode.FAULT else Attention.NOTHING
 
 
@@ -81,9 +86,8 @@ class Fleet:
 
     def _on_summary(self, sample: zenoh.Sample) -> None:
         _, robot, *_ = str(sample.key_expr).split("/")
-        try:
+        summary = None
+        with contextlib.suppress(RefusedError):
             summary = boundary.decode(sample.payload.to_bytes(), RobotSummary, "not a summary", str(sample.encoding))
-        except RefusedError:  # not a summary; only robots should publish on this key
-            return
         with self._lock:
             self._members[robot] = Member(robot, summary, self._clock())
