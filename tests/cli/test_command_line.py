@@ -830,7 +830,7 @@ class Endless(Slow):
         yield SimpleNamespace(goal=None, seq=1)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 @pytest.mark.parametrize("line", ["goto 0 0 0 --wait", "move 0 0 0 --wait", "sliders 0 0 0 --wait", "jog 0.01 0 0"])
 def test_a_signal_that_ends_the_command_stops_the_robot_first(
     monkeypatch: pytest.MonkeyPatch, line: str, number: signal.Signals

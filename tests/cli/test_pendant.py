@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import select
+import signal
 import termios
 import threading
 import tty
@@ -139,6 +140,20 @@ def test_ctrl_s_does_not_suspend_the_output(tty_pair: tuple[int, int], operator:
     assert before[0] & termios.IXON
     with pendant._raw(operator.pendant):
         assert not termios.tcgetattr(tty_pair[1])[0] & termios.IXON
+    assert termios.tcgetattr(tty_pair[1]) == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGQUIT], ids=lambda number: number.name)
+def test_a_signal_that_ends_the_pendant_restores_the_terminal(
+    number: signal.Signals, tty_pair: tuple[int, int], operator: Operator
+) -> None:
+    before = termios.tcgetattr(tty_pair[1])
+    earlier = signal.signal(number, signal.SIG_IGN)  # its default would end this process
+    try:
+        with pytest.raises(pendant._TerminalClosed), pendant._raw(operator.pendant):
+            signal.raise_signal(number)
+    finally:
+        signal.signal(number, earlier)
     assert termios.tcgetattr(tty_pair[1]) == before
 
 

@@ -289,7 +289,8 @@ help_pages.arrange(app)
 
 
 def _terminated(number: int, _frame: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_IGN)  # timeout(1) sends it twice, which would interrupt the exit
+    # timeout(1) sends SIGTERM twice, which would interrupt the exit. A second Ctrl-\ is meant to.
+    signal.signal(number, signal.SIG_DFL if number == signal.SIGQUIT else signal.SIG_IGN)
     raise terminal.Terminated(number)
 
 
@@ -299,7 +300,7 @@ def main() -> None:
     os.environ["RERUN"] = "on"  # otherwise a shell that switches Rerun off for other programs would empty every view
     warnings.showwarning = lambda message, *_, **__: terminal.print_error(str(message))
     try:
-        for number in (signal.SIGTERM, signal.SIGHUP):
+        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
             if signal.getsignal(number) is signal.SIG_DFL:  # unless it is ignored, as under nohup
                 signal.signal(number, _terminated)
         code = app(

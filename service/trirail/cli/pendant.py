@@ -273,7 +273,7 @@ def _raw(pendant: Pendant) -> Iterator[None]:
         signal.signal(number, suspended)
         _read_single_keys(descriptor)
 
-    handlers = {signal.SIGHUP: hung_up, signal.SIGTERM: hung_up, signal.SIGTSTP: suspended}
+    handlers = dict.fromkeys((signal.SIGHUP, signal.SIGTERM, signal.SIGQUIT), hung_up) | {signal.SIGTSTP: suspended}
     earlier = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     _read_single_keys(descriptor)
     try:
