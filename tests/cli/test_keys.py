@@ -170,6 +170,18 @@ def test_what_cannot_be_is_refused_in_one_line(here: Path, arguments: tuple[str,
     assert {path: path.read_bytes() for path in here.rglob("*.*") if path.is_file()} == before
 
 
+@pytest.mark.parametrize("days", ["0", "1e-9", "3651"])
+@pytest.mark.parametrize("command", ["init", "add bob --role viewer", "robot second", "renew ann"])
+def test_days_that_no_certificate_can_have_change_no_file(here: Path, command: str, days: str) -> None:
+    folder = "new" if command == "init" else "keys"
+    keys("init", "--robot", "demo")
+    keys("add", "ann", "--role", "viewer")
+    before = {path: path.read_bytes() for path in here.rglob("*") if path.is_file()}
+    with pytest.raises(CycloptsError, match=r"use 0\.01 to 3650"):
+        keys(*command.split(), "--days", days, "--folder", folder)
+    assert {path: path.read_bytes() for path in here.rglob("*") if path.is_file()} == before
+
+
 def test_a_folder_is_whole_or_not_there(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written: list[Path] = []
     write = key_folder._write

@@ -32,8 +32,8 @@ Addresses = Annotated[
 HERE = Path("keys")
 LOCAL = ("localhost", "127.0.0.1", "::1")
 """Addresses of the robot's own machine, which every robot's certificate contains."""
-MAX_DAYS = 3650.0
-"""Maximum validity of a certificate in days, which is the validity of the authority itself."""
+MIN_DAYS, MAX_DAYS = 0.01, 3650.0
+"""Validity of a certificate in days. The maximum is the validity of the authority itself."""
 
 
 def _check_hosts(addresses: tuple[str, ...]) -> None:
@@ -45,8 +45,8 @@ def _check_hosts(addresses: tuple[str, ...]) -> None:
 
 
 def _check_days(days: float) -> None:
-    if not 0.0 < days <= MAX_DAYS:
-        raise ValueError(f"above 0, at most {MAX_DAYS:g}")
+    if not MIN_DAYS <= days <= MAX_DAYS:
+        raise ValueError(f"use {MIN_DAYS:g} to {MAX_DAYS:g}")
 
 
 @app.command
