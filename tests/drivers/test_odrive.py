@@ -219,6 +219,32 @@ class TestConfigure:
         rig.drives.reset()
         assert [rig.cycle().fault for _ in range(2 * rate_hz)] == [None] * 2 * rate_hz
 
+    @pytest.mark.parametrize("boots", [False, True])
+    def test_a_drive_that_is_heard_again_after_a_silence_is_led_down_no_ramp(
+        self, closing: Closing, boots: bool
+    ) -> None:
+        """It may have restarted, and armed itself, and count from another place. A drive that is not heard is led."""
+        slow = msgspec.structs.replace(CONFIG, quick_stop_deceleration=0.7, stop_timeout=1.0)
+        rig = closing(Rig(slow, watchdog=0.3))
+        rig.ready()
+        rig.enable()
+        rig.move(200, (0.5, 0.4, -0.3))
+        device = rig.devices[0]
+        device.silent = True
+        rig.move(4, (0.5, 0.4, -0.3))
+        rig.cycles(200)
+        if boots:
+            device.silent, device.axis_state, device._zero = False, AxisState.CLOSED_LOOP_CONTROL, device.servo.position
+        rig.bus.sent.clear()
+        rig.cycle()  # in which it is heard
+        told = rig.commands()[0]
+        rig.bus.sent.clear()
+        rig.cycles(300)
+        setpoints = [can_id for can_id, _ in rig.bus.sent if can_id == cansimple.identifier(0, cansimple.SET_INPUT_POS)]
+        assert bool(setpoints) is not boots
+        assert told == []
+        assert ((cansimple.SET_AXIS_STATE, AxisState.IDLE) in rig.commands()[0]) is boots
+
     def test_a_drive_that_is_not_heard_any_more_is_not_said_to_have_power_now(self, ready: Rig) -> None:
         ready.enable()
         ready.devices[0].silent = True

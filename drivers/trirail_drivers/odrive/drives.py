@@ -348,7 +348,7 @@ class Odrive(Driver[OdriveAxis]):
 
     def _target_state(self, axis: OdriveAxis) -> AxisState | None:
         """Return the state in which a drive should be now, or None if its present state should not change."""
-        if axis.restarted or (self._enabled and axis.left_out):
+        if axis.has_returned or (self._enabled and axis.left_out):
             return AxisState.IDLE
         if not self._enabled:
             return None if self._setpoints.stopping else AxisState.IDLE

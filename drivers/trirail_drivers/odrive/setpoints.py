@@ -97,7 +97,7 @@ class SetpointSender:
     def _send(self, setpoints: Sequence[tuple[float, float]], sent: int = 0) -> None:
         """Send setpoints except the first `sent`, which are already on the bus. Each takes effect when it arrives.
 
-        A drive that has restarted is sent none, since its positions may count from another place.
+        A drive that has returned is sent none, since its positions may count from another place.
         """
         for axis, (metres, rate) in zip(self._axes, setpoints, strict=True):
             axis.sent, axis.sent_rate = metres, rate
@@ -105,7 +105,7 @@ class SetpointSender:
                 axis.in_force = metres
         stopping = self.stopping
         for number, (axis, (metres, rate)) in enumerate(zip(self._axes, setpoints, strict=True)):
-            if axis.restarted:
+            if axis.has_returned:
                 continue
             scale_setpoint(axis, metres, rate)
             put_setpoint(axis, self._frames.frames[number, DATA_AT:])
