@@ -307,6 +307,33 @@ def test_a_call_that_a_signal_handler_interrupts_to_stop_sends_nothing_after_the
     assert answered == ["trirail/demo/cmd/ann/stop "]
 
 
+@pytest.mark.parametrize("name", STOPPING)
+def test_what_a_signal_handler_sends_after_its_stop_is_sent(
+    robot: Robot, slow: Slow, stopping_signal: int, name: str
+) -> None:
+    """Also if the handler interrupts a stop."""
+    handled: list[object] = []
+
+    def stop_and_go(*_: object) -> None:
+        robot.stop()
+        handled.append(robot.move_to(0.01, 0.0, 0.0, id="g"))
+
+    def press() -> None:
+        first = slow.next()
+        signal.pthread_kill(main, stopping_signal)
+        reply(slow.next(), CommandReply("stop", "holding", 1))
+        reply(slow.next(), GoalReply("g", 1.0))
+        wait_until(lambda: bool(handled))
+        reply(first, CommandReply(name, "holding", 1))
+
+    signal.signal(stopping_signal, stop_and_go)
+    main = threading.get_ident()
+    pressing = threading.Thread(target=press)
+    pressing.start()
+    STOPPING[name](robot)
+    pressing.join()
+
+
 @pytest.mark.parametrize("taken_back", ["resumed", "refused"])
 def test_a_path_begins_after_a_pause_that_was_taken_back_on_the_way_to_its_first_point(
     robot: Robot, slow: Slow, monkeypatch: pytest.MonkeyPatch, taken_back: str
@@ -384,13 +411,15 @@ def test_a_goal_that_a_stop_overtakes_on_its_way_is_stopped_when_it_is_accepted(
 def test_a_command_that_a_stop_overtakes_on_its_way_is_followed_by_that_stop(
     robot: Robot, slow: Slow, name: str, stop: str
 ) -> None:
-    sending = Call(lambda: robot.command(name))
-    late = slow.next()
-    stop_and_confirm(robot, slow, stop)
-    reply(late, CommandReply(name, "holding", 2))
-    assert sending.end().mode == "holding"
-    with slow.next() as again:
-        assert str(again.key_expr) == f"trirail/demo/cmd/ann/{stop}"
+    for cycle, overtaken in ((0, False), (2, True)):
+        sending = Call(lambda: robot.command(name))
+        late = slow.next()
+        stop_and_confirm(robot, slow, stop)
+        reply(late, CommandReply(name, "holding", cycle))
+        assert sending.end().mode == "holding"
+        if overtaken:
+            with slow.next() as again:
+                assert str(again.key_expr) == f"trirail/demo/cmd/ann/{stop}"
 
 
 @pytest.mark.parametrize("name", ["pause", "the stop of another goal"])

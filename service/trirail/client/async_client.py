@@ -608,24 +608,28 @@ class AsyncRobot:
         within = {Command.HOME: HOME_WITHIN, Command.ENABLE: ENABLE_WITHIN}.get(command, REPLY_WITHIN)
         before = began if command.starts else math.inf
         reply = await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
-        # A later stop may have overtaken the command on its separate way.
-        for overtaking in self._connection.later_stops(before) & STOPS:
+        for overtaking in self._connection.overtaking_stops(before, reply.seq) & STOPS:
             with contextlib.suppress(ServiceError):  # the connection is closed
                 self._connection.query_unanswered(("cmd", self.user, overtaking), None)
         if command is Command.RESUME:
-            self._connection.forget_stop(Command.PAUSE)
+            self._connection.forget_pause(began)
         return reply
 
     async def _stop(self, command: Command, payload: bytes | None) -> CommandReply:
         """Send a command that stops the robot. What the client was called for earlier is not sent afterwards."""
-        noted = self._connection.note_stop(command) if stops_everything(command, payload) else -math.inf
-        try:
-            if command in STOPS:
-                return await self._connection.stop(self.user, command, payload, REPLY_WITHIN)
-            return await self._connection.fetch(("cmd", self.user, command), CommandReply, payload)
-        except RefusedError:
-            self._connection.forget_stop(command, noted)
-            raise
+        everything, called_for = stops_everything(command, payload), called_at()
+        if everything:
+            self._connection.note_stop(command)
+        if command is Command.PAUSE:
+            try:
+                return await self._connection.fetch(("cmd", self.user, command), CommandReply, payload)
+            except RefusedError:
+                self._connection.forget_pause(called_for)
+                raise
+        reply = await self._connection.stop(self.user, command, payload, REPLY_WITHIN)
+        if everything:
+            self._connection.confirm_stop(command, reply.seq)
+        return reply
 
     async def info(self) -> Info:
         """Return the robot's geometry, limits, rates and versions."""

@@ -123,9 +123,17 @@ class AsyncConnection:
         """Store the time of the present call, which stops the robot; return that time [s]."""
         return self._connection.note_stop(name)
 
-    def forget_stop(self, name: Command, at: float = math.inf) -> None:
-        """Forget a stop that was called at the time `at` [s] or earlier, because it was refused or taken back."""
-        self._connection.forget_stop(name, at)
+    def confirm_stop(self, name: Command, cycle: int) -> None:
+        """Store the cycle in which a stop took effect."""
+        self._connection.confirm_stop(name, cycle)
+
+    def forget_pause(self, until: float) -> None:
+        """Forget a pause that was called at the time `until` [s] or earlier, because it was refused or taken back."""
+        self._connection.forget_pause(until)
+
+    def overtaking_stops(self, began: float, cycle: int) -> set[Command]:
+        """Return the stops that were called later than `began` [s], but took effect before a `cycle`."""
+        return self._connection.overtaking_stops(began, cycle)
 
     def later_stops(self, began: float) -> set[Command]:
         """Return the commands that stop the robot and were called later than `began` [s]."""

@@ -50,13 +50,16 @@ class _Call(Generic[T]):
     """Coroutine that the event loop runs for another thread. The result is handed over in `future`, or undone."""
 
     def __init__(
-        self, coroutine: Coroutine[Any, Any, T], undo: Callable[[], Coroutine[Any, Any, object]] | None = None
+        self,
+        coroutine: Coroutine[Any, Any, T],
+        undo: Callable[[], Coroutine[Any, Any, object]] | None = None,
+        at: float | None = None,
     ) -> None:
         self.future: Future[T] = Future()
         self._coroutine = coroutine
         self._undo = undo
         self._task: asyncio.Task[T] | None = None
-        self._called_at = called_at()
+        self._called_at = called_at() if at is None else at
 
     def start(self) -> None:
         """Start the coroutine. Call this function in the event loop."""
@@ -104,15 +107,21 @@ class LoopThread:
         self._thread.start()
 
     def call(
-        self, coroutine: Coroutine[Any, Any, T], undo: Callable[[], Coroutine[Any, Any, object]] | None = None
+        self,
+        coroutine: Coroutine[Any, Any, T],
+        undo: Callable[[], Coroutine[Any, Any, object]] | None = None,
+        *,
+        at: float | None = None,
     ) -> T:
         """Run a coroutine and return its result. An exception in the waiting thread, such as Ctrl-C, cancels it.
+
+        `at` is the time at which the program called for the coroutine [s]; by default, that of `called_at`.
 
         If such an exception arrives before the coroutine starts or after it ends, the coroutine function `undo` is run
         instead, so that the result is either returned or undone. A cancelled coroutine may still send a stop, so the
         call waits a short time for its end. Raises ServiceError if the loop is closed before the coroutine ends.
         """
-        call = _Call(coroutine, undo)
+        call = _Call(coroutine, undo, at)
         if threading.current_thread() is self._thread or getattr(_callback, "runs", False):
             call.discard()
             raise ServiceError("a function that the robot calls must not call the robot: call it from another thread")

@@ -50,8 +50,7 @@ def _call(
 
     @functools.wraps(method)
     def call(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        with called(time.monotonic()):  # also in a signal handler, which interrupts another call
-            return robot._loop.call(method(robot._robot, *args, **kwargs))
+        return robot._loop.call(method(robot._robot, *args, **kwargs))
 
     return call
 
@@ -66,8 +65,7 @@ def _stop(
 
     @functools.wraps(method)
     def call(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        with called(time.monotonic()):
-            return robot._stop_loop.call(method(robot._stopping, *args, **kwargs))
+        return robot._stop_loop.call(method(robot._stopping, *args, **kwargs), at=time.monotonic())
 
     return call
 

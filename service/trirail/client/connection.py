@@ -83,6 +83,8 @@ class Connection:
         self._known = 0, 0.0
         self._stopped_at = {name: -math.inf for name in Command if name.stops}
         """Time of the newest call of each command that stops the robot, on the monotonic clock [s]."""
+        self._stop_cycles = dict.fromkeys(self._stopped_at, math.inf)
+        """Cycle in which the newest call of each of these commands took effect; infinite if it is not confirmed."""
         self._here = self._opened.liveliness().declare_token(self.key("here", user)) if user is not None else None
 
     @property
@@ -161,13 +163,21 @@ class Connection:
     def note_stop(self, name: Command) -> float:
         """Store the time of the present call, which stops the robot; return that time [s]."""
         at = called_at()
-        self._stopped_at[name] = max(self._stopped_at[name], at)
+        self._stopped_at[name], self._stop_cycles[name] = max(self._stopped_at[name], at), math.inf
         return at
 
-    def forget_stop(self, name: Command, at: float = math.inf) -> None:
-        """Forget a stop that was called at the time `at` [s] or earlier, because it was refused or taken back."""
-        if self._stopped_at[name] <= at:
-            self._stopped_at[name] = -math.inf
+    def confirm_stop(self, name: Command, cycle: int) -> None:
+        """Store the cycle in which a stop took effect."""
+        self._stop_cycles[name] = cycle
+
+    def forget_pause(self, until: float) -> None:
+        """Forget a pause that was called at the time `until` [s] or earlier, because it was refused or taken back."""
+        if self._stopped_at[Command.PAUSE] <= until:
+            self._stopped_at[Command.PAUSE] = -math.inf
+
+    def overtaking_stops(self, began: float, cycle: int) -> set[Command]:
+        """Return the stops that were called later than `began` [s], but took effect before a `cycle`."""
+        return {name for name in self.later_stops(began) if self._stop_cycles[name] < cycle}
 
     def later_stops(self, began: float) -> set[Command]:
         """Return the commands that stop the robot and were called later than `began` [s]."""

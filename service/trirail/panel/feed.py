@@ -35,8 +35,10 @@ RESTART_S = 0.5
 """Minimum change of the service's start time that shows a restart [s].
 
 A restart takes longer, and the start time also changes by the ticks that the loop misses between two states."""
-MAX_DRIFT = 1e-3
-"""Maximum relative difference in speed of the clocks of this machine and the service's machine."""
+MAX_DRIFT = 5e-3
+"""Rate at which the shortest delay of states may grow. Clocks of two machines drift, and that of a virtual machine may
+jump when the machine is paused.
+"""
 MAX_STATE_AGE_S = 0.5
 """Minimum of the limit of the age of the newest state on the page at which the page can move the robot [s].
 
