@@ -7,13 +7,22 @@ import math
 
 import msgspec
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from trirail.client import trajectory
 from trirail.client.path_check import CheckedPath, check_path, find_obstacle
 from trirail.config import SIM, FramesTable, load
+from trirail.kinematics.robot import inverse
+from trirail.motion.backlash_reserve import planned_limits
+from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.limits import Bounds
 from trirail.motion.runs import centre_motion, rest
+from trirail.motion.schedule import Schedule
 from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.wire.goals import TrajectoryGoal
+from trirail.wire.packed_trajectory import packed
+from trirail.workspace.singularity import distance_to_singularity
 from trirail.workspace.violations import violations
 from trirail_drivers.interface import Triple
 
@@ -65,6 +74,44 @@ def test_a_limit_of_the_platform_is_an_obstacle_with_its_values(axis: int, sign:
     assert find_obstacle(robot, outside, inside, None, "base") is None
     pose[axis] += 2.0 * sign * beyond
     assert find_obstacle(robot, outside, (pose[0], pose[1], pose[2]), None, "base")
+
+
+@given(st.floats(-math.tau, math.tau), st.floats(-0.5, 0.5), st.sampled_from([-1, 0, 1]))
+def test_an_angle_in_a_frame_is_the_same_after_a_whole_turn(turned: float, phi: float, turns: int) -> None:
+    robot = dataclasses.replace(ROBOT, frames=FramesTable(work={"table": (0.0, 0.0, turned)}))
+    assert find_obstacle(robot, ZERO, (0.0, 0.0, phi - turned + turns * math.tau), None, "table") is None
+
+
+@pytest.mark.parametrize("limit", ["position", "passive", "singularity_margin"])
+def test_a_robot_beyond_a_limit_of_its_joints_may_return_but_not_move_farther(limit: str) -> None:
+    start, farther = (0.1, 0.02, 0.4), (0.12, 0.024, 0.48)
+    limits, motion = CONFIGURED.limits, inverse(ROBOT.geometry, start)
+    if limit == "singularity_margin":
+        margin = float(distance_to_singularity(ROBOT.geometry, start)) + 0.01
+        limits = msgspec.structs.replace(limits, singularity_margin=margin)
+    else:
+        values = motion.position if limit == "position" else motion.passive_position
+        ends = -1.0, float(values.max()) - 1e-4
+        limits = msgspec.structs.replace(limits, slider=msgspec.structs.replace(limits.slider, **{limit: ends}))
+    robot = dataclasses.replace(ROBOT, limits=limits)
+    assert violations(robot.geometry, limits, start)
+    assert find_obstacle(robot, start, ZERO, None, "base") is None
+    assert find_obstacle(robot, start, start, None, "base") is None
+    assert find_obstacle(robot, start, farther, None, "base") is not None
+
+
+def test_a_path_is_checked_as_the_service_plans_it_with_backlash() -> None:
+    limits = CONFIGURED.limits
+    slow = msgspec.structs.replace(limits, slider=msgspec.structs.replace(limits.slider, velocity=0.1))
+    without = dataclasses.replace(ROBOT, limits=slow)
+    robot = dataclasses.replace(without, backlash=(1e-4, 1e-4, 1e-4))
+    text = "t,x,y,phi\n0,0,0,0\n0.01,0.05,0,0"
+    reserved = check_path(robot, "a.csv", text, True)
+    assert not reserved.why
+    assert reserved.duration > check_path(without, "a.csv", text, True).duration
+    planner = GoalPlanner(robot.geometry, planned_limits(robot.limits, robot.backlash), 1.0 / robot.rate_hz)
+    goal = packed(TrajectoryGoal(tuple(trajectory.parse("a.csv", text)), stretch=True))
+    assert reserved.duration == planner.plan(goal, Schedule(rest(ZERO), 1.0 / robot.rate_hz), 1.0, 0).duration
 
 
 rows = st.lists(st.lists(st.one_of(st.floats(-2.0, 2.0).map(str), st.text(max_size=5)), max_size=6).map(",".join))

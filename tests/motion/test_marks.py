@@ -15,8 +15,9 @@ from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.marks import BISECTIONS, MAX_SWITCHES, GoalMarks, Placed, place_marks
 from trirail.motion.runs import ZERO_RATES, Run, rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.marks import Crossing, Mark
+from trirail.wire.packed_trajectory import packed
 
 ROBOTS = {"3-PRP": load(SIM), "3-PPR": load(SIM.with_name("uvw-ppr.toml"))}
 FINE = 20_000
@@ -179,6 +180,30 @@ def test_marks_that_the_path_does_not_pass_are_refused(mark: Mark, words: str) -
         placed("3-PRP", run, mark)
     assert refused.value.code is RefusalCode.BAD_MARK
     assert words in str(refused.value)
+
+
+@pytest.mark.parametrize("below", [1e-7, 2e-6, 5e-5])
+@pytest.mark.generated(0, 1, 2)
+def test_a_mark_just_before_the_path_turns_round_is_passed_there(below: float, seed: int) -> None:
+    """Not at a later place with this coordinate; and the path turns where its length has a corner."""
+    rng = np.random.default_rng(seed)
+    peak, after = rng.uniform(0.01, 0.03), rng.uniform(3.0, 5.0)
+    points = (
+        TrajectoryPoint(0.0, 0.0, 0.0, 0.0),
+        TrajectoryPoint(2.0, peak, 0.0, 0.0, velocity=(0.02, 0.0, 0.0)),
+        TrajectoryPoint(2.0 + after, peak, 0.0, 0.0, velocity=(-0.02, 0.0, 0.0)),
+        TrajectoryPoint(12.0, 0.0, 0.0, 0.0),
+        TrajectoryPoint(18.0, 0.06, 0.02, 0.0),
+    )
+    run = planned("3-PRP", packed(TrajectoryGoal(points)))
+    s, _, tool = traced(run, (0.0, 0.0))
+    first = int(np.argmax(tool[s < 10.0, 0]))
+    value = float(tool[first, 0]) - below
+    found = placed("3-PRP", run, Mark("valve", at=Crossing(x=value)))
+    assert found.switches["s"][0] == pytest.approx(s[np.argmax(tool[:, 0] > value)], abs=2.0 * run.path.duration / FINE)
+    lengths = np.cumsum(np.hypot(*np.diff(tool, axis=0).T))
+    share = placed("3-PRP", run, Mark("valve", after_start=float(lengths[-1]) * 0.9))
+    assert share.switches["s"][0] == pytest.approx(s[1 + np.searchsorted(lengths, 0.9 * lengths[-1])], abs=2e-3)
 
 
 @pytest.mark.parametrize("kind", ROBOTS)

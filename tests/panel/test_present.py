@@ -102,7 +102,7 @@ def test_without_the_service_s_states_a_stop_is_sent_and_the_page_does_not_deny_
 def test_a_way_is_checked_again_when_the_robot_stands_elsewhere(enabled: Page, robot: FakeRobot) -> None:
     typed(enabled, "100", "0", "0")
     enabled.until("document.querySelector('#going').dataset.may === 'yes'")
-    robot.pose = (0.22, 0.0, 0.0)
+    robot.pose = (0.151, 0.212, -0.654)
     enabled.until("document.querySelector('#going').dataset.may === 'no'")
     assert "on the way" in enabled.text("#going-says")
 

@@ -13,14 +13,18 @@ from trirail_drivers.interface import Triple
 
 from trirail.client import trajectory
 from trirail.client.outgoing import goal_messages
+from trirail.config import Limits
 from trirail.errors import KinematicsError, RefusalCode, RefusedError, TrirailError
+from trirail.motion.backlash_reserve import planned_limits
 from trirail.motion.goal_planner import GoalPlanner
+from trirail.motion.kinds.pose import PoseMotion
 from trirail.motion.limits import Bounds, Violation
+from trirail.motion.paths import ROUNDING
 from trirail.motion.runs import centre_motion, nominal_motion, rest, tool_motion
 from trirail.motion.schedule import Schedule
-from trirail.motion.tool_frames import NamedFrames, rotated
+from trirail.motion.tool_frames import NamedFrames, tool_point
 from trirail.telemetry.drawn_robot import DrawnRobot
-from trirail.wire.goals import Tool, TrajectoryGoal
+from trirail.wire.goals import PoseGoal, Tool, TrajectoryGoal
 from trirail.wire.packed_trajectory import packed
 from trirail.workspace.violations import violations
 
@@ -53,7 +57,7 @@ def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | No
     The function checks positions, passive travel, the limits of the platform and the singularity margin. Only the
     service checks the speeds, and the path between the checked poses.
 
-    As in the service, a robot beyond a limit of the platform may move, if it moves no farther beyond that limit.
+    As in the service, a robot beyond a limit may move, if it moves no farther beyond that limit.
 
     Parameters
     ----------
@@ -73,25 +77,39 @@ def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | No
     Obstacle | None
         Obstacle nearest to the end of the line; None if there is no obstacle.
     """
-    names = NamedFrames(robot.frames)
+    names, (x, y, phi) = NamedFrames(robot.frames), end
     try:
-        point, (x, y, angle) = names.tool(tool), names.frame(frame)
+        goal = PoseMotion.resolve(PoseGoal(x, y, phi, tool=tool, frame=frame), names, lambda _: start)
     except RefusedError as error:
         return Obstacle(str(error), code=error.code)
-    bounds = Bounds(robot.limits, 1.0 / robot.rate_hz, labels=robot.geometry.labels)
-    u, v = rotated(end[0], end[1], angle)
-    first, last = np.array(tool_motion(rest(start), point).pose), np.array((x + u, y + v, angle + end[2]))
+    point, limits = tool_point(goal.tool), planned_limits(robot.limits, robot.backlash)
+    bounds = Bounds(limits, 1.0 / robot.rate_hz, labels=robot.geometry.labels)
+    first, last = np.array(tool_motion(rest(start), point).pose), np.array((goal.x, goal.y, goal.phi))
+    try:
+        before = _violations(robot, limits, start)
+    except KinematicsError:
+        before = {}
     for share in np.linspace(1.0, 0.0, CHECKED_POSES, endpoint=False):
         pose = centre_motion(rest((share * last + (1.0 - share) * first).tolist()), point).pose
         if outside := bounds.pose_violation_from(pose, start):
             return _obstacle(outside, bool(share < 1.0))
         try:
-            exceeded = violations(robot.geometry, robot.limits, np.asarray(pose))
+            exceeded = _violations(robot, limits, pose)
         except KinematicsError as error:
             return Obstacle(str(error), bool(share < 1.0), "unreachable", error.leg)
-        if exceeded:
-            return _obstacle(exceeded[0], bool(share < 1.0))
+        for key, violation in exceeded.items():
+            if key not in before or _excess(violation) > _excess(before[key]) + ROUNDING:
+                return _obstacle(violation, bool(share < 1.0))
     return None
+
+
+def _violations(robot: DrawnRobot, limits: Limits, pose: Sequence[float]) -> dict[tuple[str, str, float], Violation]:
+    """Return the violations of the limits of the joints at a pose, by slider or coordinate, quantity and limit."""
+    return {(each.axis, each.quantity, each.limit): each for each in violations(robot.geometry, limits, pose)}
+
+
+def _excess(violation: Violation) -> float:
+    return abs(violation.value - violation.limit)
 
 
 def _obstacle(exceeded: Violation, on_way: bool) -> Obstacle:
@@ -129,7 +147,8 @@ def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> Checke
         goal, period = TrajectoryGoal(points, stretch=stretch), 1.0 / robot.rate_hz
         goal_messages(goal, "checked")  # the checks of the client
         _check_first_pose(robot, line[0])  # the planner lets a robot that is outside the limits stand or return
-        planner, schedule = GoalPlanner(robot.geometry, robot.limits, period), Schedule(rest(line[0]), period)
+        limits = planned_limits(robot.limits, robot.backlash)
+        planner, schedule = GoalPlanner(robot.geometry, limits, period), Schedule(rest(line[0]), period)
         planned = planner.plan(packed(goal), schedule, 1.0, 0)
     except (TrirailError, ValueError) as error:
         code = error.code if isinstance(error, RefusedError) else "unreadable"
@@ -142,8 +161,9 @@ def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> Checke
 
 def _check_first_pose(robot: DrawnRobot, pose: Triple) -> None:
     """Raise RefusedError if a pose is outside the limits, and KinematicsError if it cannot be reached."""
-    outside = Bounds(robot.limits, 1.0 / robot.rate_hz, labels=robot.geometry.labels).pose_violation(pose)
-    exceeded = [outside] if outside else violations(robot.geometry, robot.limits, pose)
+    limits = planned_limits(robot.limits, robot.backlash)
+    outside = Bounds(limits, 1.0 / robot.rate_hz, labels=robot.geometry.labels).pose_violation(pose)
+    exceeded = [outside] if outside else violations(robot.geometry, limits, pose)
     if exceeded:
         value, limit = exceeded[0].value, exceeded[0].limit
         text = f"the first point is outside the limits: {exceeded[0]}"

@@ -163,7 +163,8 @@ class _Trace:
         self._near = np.array(start, dtype=np.float64)
         shares = np.linspace(0.0, 1.0, SAMPLES, endpoint=False)
         spans = np.diff(path.knots)
-        self.times = np.append((path.knots[:-1, None] + shares * spans[:, None]).ravel(), path.duration)
+        times = np.append((path.knots[:-1, None] + shares * spans[:, None]).ravel(), path.duration)
+        self.times = np.union1d(times, self._turning_points(times))
         self.coordinates = self.states(self.times)[0]
         self._lengths = np.append(0.0, np.cumsum(self._integrate(self.times[:-1], self.times[1:])))
 
@@ -196,6 +197,18 @@ class _Trace:
         states = np.empty_like(motion)
         states[order] = motion
         return states[:, 0], states[:, 1]
+
+    def _turning_points(self, times: Array) -> Array:
+        """Return the times at which a coordinate turns round between two consecutive `times`."""
+        rates = self.states(times)[1]
+        turns = (rates[:-1] * rates[1:] < 0.0) & (np.abs(rates[:-1]) + np.abs(rates[1:]) > ROUNDING)
+        k, axis = np.nonzero(turns)
+        low, high, before = times[k], times[k + 1], np.sign(rates[k, axis])
+        for _ in range(BISECTIONS if len(k) else 0):
+            middle = (low + high) / 2.0
+            same = np.sign(self.states(middle)[1][np.arange(len(k)), axis]) == before
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+        return high
 
     def pose_at(self, s: float) -> tuple[float, float, float]:
         """Return the pose of the platform's centre at a time along the path."""

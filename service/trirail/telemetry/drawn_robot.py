@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from trirail_drivers.interface import NAMES
+from trirail_drivers.interface import NAMES, Triple
 
 from trirail import config
 from trirail.config import Config, FramesTable, Limits
@@ -23,6 +23,9 @@ prepare(GeometryTable)
 
 DIGITAL = "/signals"
 """Parent entity of outputs and inputs. Views sort their lanes by name; this name puts the lane of the mode first."""
+
+
+NO_BACKLASH: Triple = (0.0, 0.0, 0.0)
 
 
 class DigitalSignal(NamedTuple):
@@ -56,6 +59,8 @@ class DrawnRobot:
     frames: FramesTable
     digital: tuple[DigitalSignal, ...] = ()
     """Digital outputs, followed by digital inputs."""
+    backlash: Triple = NO_BACKLASH
+    """Compensated backlash of the sliders A, B, C [m]."""
 
     @classmethod
     def from_config(cls, settings: Config) -> DrawnRobot:
@@ -69,6 +74,7 @@ class DrawnRobot:
             settings.loop.rate_hz,
             settings.frames,
             (*outputs, *inputs),
+            settings.correction.backlash,
         )
 
     @classmethod
@@ -86,7 +92,9 @@ class DrawnRobot:
             raise ServiceError(f"the service has another version, {info.version}: {error}") from error
         outputs = [_signal("output", name, line.drive, line.bit) for name, line in info.output_lines.items()]
         inputs = [_signal("input", name, line.drive, line.bit) for name, line in info.input_lines.items()]
-        return cls(info.robot, geometry, limits, info.rate_hz, frames, (*outputs, *inputs))
+        digital = *outputs, *inputs
+        backlash = info.correction.backlash if info.correction is not None else NO_BACKLASH
+        return cls(info.robot, geometry, limits, info.rate_hz, frames, digital, backlash)
 
 
 def _signal(kind: Literal["output", "input"], name: str, drive: str, bit: int) -> DigitalSignal:
