@@ -460,6 +460,7 @@ def typed(page: Page, *words: str) -> None:
         (("20", "-10", "10"), (0.02, -0.01, math.radians(10.0))),
         (("2,5", "500 um", "-30arcsec"), (0.0025, 0.0005, -math.radians(30.0 / 3600.0))),
         (("0.01 m", "1in", "5mrad"), (0.01, 0.0254, 0.005)),
+        (("0,125", "-1,2500", "0"), (0.000125, -0.00125, 0.0)),
     ],
 )
 def test_a_pose_that_is_typed_is_checked_and_gone_to_when_told(
@@ -473,6 +474,16 @@ def test_a_pose_that_is_typed_is_checked_and_gone_to_when_told(
     enabled.click("#go")
     enabled.until("document.querySelector('#answer').textContent === 'go there: arrived'")
     assert robot.pose == pytest.approx(pose, abs=1e-12)
+
+
+@pytest.mark.parametrize("word", ["10,000", "1,250 mm", "-125,000"])
+def test_a_comma_that_may_separate_thousands_is_no_number(word: str, enabled: Page) -> None:
+    typed(enabled, "1", "2", "3")
+    enabled.until("document.querySelector('#going').dataset.may === 'yes'")
+    typed(enabled, word, "2", "3")
+    enabled.until("document.querySelector('#to-x').getAttribute('aria-invalid') === 'true'")
+    assert "may mean thousands" in enabled.text("#going-says")
+    assert enabled.evaluate("document.querySelector('#going').dataset.may") == ""
 
 
 def test_what_is_in_the_way_is_said_before_anything_moves(enabled: Page) -> None:

@@ -11,10 +11,10 @@ const AXES = ["x", "y", "phi"];
 const AGAIN = 500; // a pose is checked again after so long where the robot has moved meanwhile [ms]
 const byId = (id) => document.getElementById(id);
 
-// A number as it was typed, with its unit, in SI; null for what is none. A decimal comma is one. Without a unit a length
-// is in that of the page.
+// A number as it was typed, with its unit, in SI; null for what is none. A decimal comma is one, but not before exactly
+// three digits, as in 10,000, where it may separate thousands. Without a unit a length is in that of the page.
 export function quantity(text, units) {
-  const found = /^\s*([+\-−]?(?:\d+[.,]?\d*|[.,]\d+))\s*([^\d\s]*)\s*$/.exec(text);
+  const found = /^\s*([+\-−]?(?![1-9]\d{0,2},\d{3}(?!\d))(?:\d+[.,]?\d*|[.,]\d+))\s*([^\d\s]*)\s*$/.exec(text);
   const size = found && units[found[2] || (units === LENGTHS ? unit() : "°")];
   return size ? Number(found[1].replace(",", ".").replace("−", "-")) * size : null;
 }
