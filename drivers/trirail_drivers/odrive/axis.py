@@ -58,8 +58,8 @@ class OdriveAxis(Axis):
         """Number of heartbeats since the last request."""
         self._started = False
         """Whether the drive is known to have finished booting."""
-        self._heard_again = False
-        """Whether the drive has been heard since it fell silent."""
+        self._sends_again = False
+        """Whether the drive has sent a message since it fell silent."""
         self._result: int = ProcedureResult.SUCCESS
         """Procedure result in the newest heartbeat."""
         self._answers_per_request = AnswersPerSync(self)
@@ -114,7 +114,7 @@ class OdriveAxis(Axis):
 
     def rejoin(self, now: float) -> None:
         """Let the drive take part in the cycle again after a set-up in the background."""
-        self.restarted = self.silent = self.powered_up = self._heard_again = False
+        self.restarted = self.silent = self.powered_up = self._sends_again = False
         self.heard = now
         self.clear_missed()
 
@@ -126,7 +126,7 @@ class OdriveAxis(Axis):
         """Handle Get_Encoder_Estimates, which contains the position at the time when the drive received the request."""
         turns, _ = cansimple.ESTIMATES.unpack(data)
         if not self.configured:  # a drive that is booting does not know its position yet
-            self._heard_again = True
+            self._sends_again = True
             return
         if math.isfinite(turns):
             self._answers_per_request.add_position(turns)
@@ -153,7 +153,7 @@ class OdriveAxis(Axis):
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Handle a heartbeat: axis state, errors and procedure result."""
         errors, self.state, self._result, _ = cansimple.BEAT.unpack(data)
-        self.heard, self._heard_again = now, self.silent
+        self.heard, self._sends_again = now, self.silent
         self._beats += 1
         self._update_errors(errors)
         if self.state == AxisState.UNDEFINED:  # INITIALIZING may be a disarm reason here, which outlasts the boot
@@ -194,10 +194,11 @@ class OdriveAxis(Axis):
 
     @property
     def has_returned(self) -> bool:
-        """Whether the drive has restarted, or has been silent and is heard again, so that its positions may count from
-        another place.
+        """Whether the drive has restarted, or sends messages again after a silence.
+
+        Its positions may then count from another place.
         """
-        return self.restarted or (self.silent and self._heard_again)
+        return self.restarted or (self.silent and self._sends_again)
 
     @property
     def powered(self) -> bool:

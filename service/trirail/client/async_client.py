@@ -616,7 +616,7 @@ class AsyncRobot:
         return reply
 
     async def _stop(self, command: Command, payload: bytes | None) -> CommandReply:
-        """Send a command that stops the robot. What the client was called for earlier is not sent afterwards."""
+        """Send a command that stops the robot. Requests that were called for earlier are not sent afterwards."""
         everything, called_for = stops_everything(command, payload), called_at()
         if everything:
             self._connection.note_stop(command)
