@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import pytest
 from certificates import tls_config, user
 from control_rig import CONFIG
 from ports import free_port
+from processes.test_gateway import came
 from refusals import refused_as
 from trirail.cli import doctor, terminal
 from trirail.cli.key_folder import KeyFolder
@@ -30,14 +31,17 @@ from trirail.client import connection
 from trirail.client.client import Robot
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.processes.certificate_expiry import STOP_BEFORE
 from trirail.processes.gateway import Gateway
 from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.credentials import Admission, Credentials
+from trirail.wire.event_codes import EventCode
+from trirail.wire.links import LinkClosed
 from trirail.wire.messages import Event, GoalReply
 from trirail.wire.packets import Accepted, Announcement, CommandDone, CommandRequest, GoalRequest, Request
 from trirail.wire.records import DTYPE
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, Stop
 from waiting import WITHIN
 
 
@@ -389,6 +393,60 @@ def test_the_doctor_tells_who_can_reach_it(served: Served, tmp_path: Path) -> No
         ("users", "ok", "eva viewer, ann operator, max maintainer"),
         ("certificates", "warning", "gone is revoked and has no role; remove this user from [zenoh.users]"),
     ]
+
+
+class StillLoop(Loop):
+    """Sends nothing, and ends when it has been asked for something of the type `awaited`."""
+
+    def __init__(self, awaited: type[Request]) -> None:
+        super().__init__()
+        self._awaited = awaited
+        self._own, self._other = socket.socketpair()
+
+    def fileno(self) -> int:
+        return self._own.fileno()
+
+    def packets(self) -> Iterator[bytes]:
+        if any(isinstance(request, self._awaited) for request in self.asked):
+            raise LinkClosed
+        yield from ()
+
+    def receive(self) -> None:
+        self._own.close()
+        self._other.close()
+        raise LinkClosed
+
+
+@pytest.mark.parametrize("left", [STOP_BEFORE, timedelta(0)])
+def test_the_robot_stops_before_its_certificate_expires_because_nobody_could_stop_it_later(
+    tmp_path: Path, left: timedelta
+) -> None:
+    config, loop, now = tls_config(tmp_path), StillLoop(CommandRequest), datetime.now(UTC)
+    read = Admission.read(tmp_path / "keys", config.zenoh.users)
+    guard = Guard(config, read._replace(credentials=read.credentials._replace(expires=now + left)))
+    with guard.open() as opened:
+        gateway = Gateway(config, loop, lambda: None, opened, guard)  # type: ignore[arg-type]
+        gateway._expiry._clock = lambda: now
+        gateway.serve(lambda: None)
+        announced, stop = loop.asked
+        assert isinstance(announced, Announcement)
+        assert (announced.notice.event_code, announced.notice.level) == (EventCode.CERTIFICATE_EXPIRES, "error")
+        assert isinstance(stop, CommandRequest)
+        assert (stop.name, stop.content) == (Command.STOP, Stop())
+        for kind, content in (("goal/ann", b'{"kind": "pose", "x": 0, "y": 0, "phi": 0}'), ("cmd/ann/enable", b"")):
+            gateway._handle(came(kind.partition("/")[0], f"trirail/demo/{kind}", content))
+        assert not any(isinstance(request, GoalRequest) for request in loop.asked)
+        assert [request.name for request in loop.asked if isinstance(request, CommandRequest)] == [Command.STOP]
+        gateway._handle(came("cmd", "trirail/demo/cmd/ann/stop", b""))
+        assert isinstance(loop.asked[-1], CommandRequest)
+        told = len(loop.asked)
+        gateway._expiry.poll()
+        assert len(loop.asked) == told  # once
+        gateway._expiry._clock = lambda: now - timedelta(seconds=1)  # the clock was set back
+        gateway._expiry.poll()
+        gateway._expiry._clock = lambda: now
+        gateway._expiry.poll()
+        assert len(loop.asked) == told + 2 * (left == STOP_BEFORE)
 
 
 def test_a_certificate_that_ends_soon_is_told(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.certificate_expiry import CertificateExpiry
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox
 from trirail.processes.incoming import Incoming
@@ -122,6 +123,7 @@ class Gateway:
         linked = partial(guard.linked, session)
         self._routers = RouterLinks(connect, linked, guard.why_not_linked, self._announce)
         self._name_conflict = NameConflict(session, self._robot, run, linked, guard.open_client, self._announce)
+        self._expiry = CertificateExpiry(guard.credentials, partial(self._requests.stop, self._robot), self._announce)
         known = {*guard.users, config.zenoh.router or ""}
         self._link_monitor = LinkMonitor(
             partial(guard.links, session),
@@ -159,6 +161,7 @@ class Gateway:
                 self._routers.poll()
                 self._link_monitor.poll()
                 self._name_conflict.poll()
+                self._expiry.poll()
                 self._requests.expire()
                 self._parts.poll()
                 self._summarize()
@@ -226,6 +229,8 @@ class Gateway:
     def _command(self, message: RoutedMessage) -> None:
         _, command = message.names
         override = command in REFUSED_IF_HIGHER and self._name_conflict.exists
+        if command in REFUSED:
+            self._expiry.check(command)
         if command in REFUSED or (override and self._is_faster(message.incoming)):
             self._name_conflict.check(command)
         self._commands.read(message.incoming, *message.names)
@@ -244,6 +249,7 @@ class Gateway:
 
     def _goal(self, message: RoutedMessage) -> None:
         self._name_conflict.check("a goal")
+        self._expiry.check("a goal")
         incoming, (user,), sent = message
         if not isinstance(sent, TrajectoryGoal):
             self._requests.goal(incoming, user, self._poses.resolve_name(sent))

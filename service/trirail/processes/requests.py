@@ -186,6 +186,16 @@ class Requests:
                 RefusalCode.BUSY, f"{all_} commands are already in progress, which is the maximum: send fewer"
             )
 
+    def stop(self, user: str) -> bool:
+        """Stop the robot and withdraw all waiting goals, for the service itself.
+
+        `user` is the name that the events show. Return False if the loop's queue is full.
+        """
+        self.backlog.withdraw_others(None, f"stop by {user}")
+        self._tickets += 1
+        with self._urgent_section():
+            return self._link.send(message(CommandRequest(self._tickets, user, Command.STOP)))
+
     # ------------------------------------------------------------------ answers
 
     def answer(self, ticket: int, content: msgspec.Struct) -> None:

@@ -35,7 +35,8 @@ class Guard:
         """Read the configuration. `admission` contains the credentials; if it is None, they are read from the files."""
         self._robot = config.robot.name
         self._listen, self._connect, self._router = config.zenoh.listen, config.zenoh.connect, config.zenoh.router
-        self._credentials: Credentials | None = None
+        self.credentials: Credentials | None = None
+        """Credentials of the robot; None for a service without certificates."""
         self.users: dict[str, Role] = {}
         """Role of each user who has a role."""
         self._gone: list[str] = []
@@ -45,10 +46,10 @@ class Guard:
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
             admission = admission or Admission.read(folder, config.zenoh.users, self._router)
-            self._credentials = admission.credentials.in_memory()
-            if self._connect and self._credentials.name != self._robot:
+            self.credentials = admission.credentials.in_memory()
+            if self._connect and self.credentials.name != self._robot:
                 raise ServiceError(
-                    f"{folder}: the certificate has the name {self._credentials.name}, but a router accepts robot "
+                    f"{folder}: the certificate has the name {self.credentials.name}, but a router accepts robot "
                     f"{self._robot} "
                     f"only with a certificate of the name {self._robot}: create one with trirail keys robot "
                     f"{self._robot}"
@@ -58,25 +59,25 @@ class Guard:
 
     def open(self) -> zenoh.Session:
         """Open the session. Raises ServiceError if listening on an address fails."""
-        if self._credentials is None:
+        if self.credentials is None:
             opened = zenoh_session.open_service(self._listen, connect=self._connect)
         else:
             rules = access_control(self._robot, self.users, self._router)
-            opened = zenoh_session.open_service(self._listen, self._credentials, rules, self._connect)
+            opened = zenoh_session.open_service(self._listen, self.credentials, rules, self._connect)
         for path in filter(None, map(socket_file, self._listen)):
             path.chmod(SOCKET_MODE)
         return opened
 
     def open_client(self, endpoint: str) -> zenoh.Session:
         """Open a client session to a router with the service's certificate. Raises ServiceError."""
-        return zenoh_session.open_client(endpoint, self._credentials)
+        return zenoh_session.open_client(endpoint, self.credentials)
 
     def stop_port(self, take: Callable[[StopRequest, Answer], None]) -> StopPort:
         """Open a stop port for each endpoint. `warnings` lists the endpoints for which that failed."""
 
         def ask(shown: str, request: StopRequest, answer: Answer) -> None:
             user, command = command_of(request, self._robot)
-            if self._credentials is not None and user != shown:
+            if self.credentials is not None and user != shown:
                 raise RefusedError(
                     RefusalCode.NOT_ALLOWED,
                     f"the certificate of {quoted(shown) or 'no user'} cannot be used to send as {user}",
@@ -84,7 +85,7 @@ class Guard:
             self.check(user, command.role, command)
             take(request, answer)
 
-        secured = None if self._credentials is None else tls.server(self._credentials)
+        secured = None if self.credentials is None else tls.server(self.credentials)
         port, self._without_stop_port = StopPort(secured, ask), []
         for address in filter(None, map(stop_address, self._listen)):
             if not isinstance(address.where, str) and any(same_port(address.where, at) for at in self._others):
@@ -108,7 +109,7 @@ class Guard:
 
         `linked` contains the addresses that have a session.
         """
-        ports = {at[1] for at in map(tcp_address, self._listen) if at is not None} if self._credentials else set()
+        ports = {at[1] for at in map(tcp_address, self._listen) if at is not None} if self.credentials else set()
         known = {at[1] for at in map(tcp_address, linked) if at is not None}
         return Counter(host for host, port in (connections(ports) if ports else ()) if port not in known)
 
@@ -123,14 +124,14 @@ class Guard:
 
     def why_not_linked(self, endpoint: str) -> str:
         """Return the reason why there is no link to an endpoint, or "" if none is found. This may take seconds."""
-        return connection_problem(endpoint, self._credentials, self._router)
+        return connection_problem(endpoint, self.credentials, self._router)
 
     def role(self, user: str) -> Role | None:
         """Return the role of a user, or None if the user has no role.
 
         If the service does not use certificates, every user has the highest role.
         """
-        return Role.MAINTAINER if self._credentials is None else self.users.get(user)
+        return Role.MAINTAINER if self.credentials is None else self.users.get(user)
 
     def check(self, user: str, needed: Role, action: str) -> None:
         """Raise RefusedError if a user's role does not include the role `needed` for an action."""
@@ -151,6 +152,6 @@ class Guard:
 
     def certificate_warnings(self) -> tuple[str, ...]:
         """Return warnings about a certificate that expires soon, and about revoked users in the configuration."""
-        soon = [] if self._credentials is None else [self._credentials.warning()]
+        soon = [] if self.credentials is None else [self.credentials.warning()]
         gone = [f"{user} is revoked and has no role; remove this user from [zenoh.users]" for user in self._gone]
         return (*filter(None, soon), *gone)

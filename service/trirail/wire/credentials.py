@@ -113,7 +113,9 @@ class Credentials(NamedTuple):
         left = self.expires - (now or datetime.now(UTC))
         if left > EXPIRY_NOTICE:
             return ""
-        return f"certificate in {self.folder}: expires in {left.days} days; renew it with: trirail keys renew"
+        hours = max(0.0, left / timedelta(hours=1))
+        within = f"{left.days} days" if left.days > 0 else f"{hours:.1f} hours"
+        return f"certificate in {self.folder}: expires in {within}; renew it with: trirail keys renew"
 
 
 class Admission(NamedTuple):

@@ -120,6 +120,10 @@ class EventCode(StrEnum):
     SESSIONS_FULL = "sessions_full", "nearly as many sessions as the gateway accepts", "used", "most"
     DESCRIPTORS_FULL = "descriptors_full", "nearly as many file descriptors as the gateway may open", "used", "most"
     CONNECTIONS_WAIT = "connections_wait", "many connections open no session", "count", "wait"
+    CERTIFICATE_EXPIRES = (
+        "certificate_expires",
+        "the robot's certificate expires in a few seconds, and the robot stops",
+    )
 
     OTHER = "other", "a code of a newer service that this client does not know"
 
