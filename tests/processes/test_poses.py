@@ -23,9 +23,10 @@ from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refused_as, uncoded
-from trirail.config import Config, LegTable, geometry, parse
+from trirail.config import Config, LegTable, corrected_geometry, geometry, parse
+from trirail.config.as_built import AsBuilt, geometry_of
 from trirail.errors import ConfigError, RefusalCode, RefusedError, ServiceError
-from trirail.kinematics.geometry import travels
+from trirail.kinematics.geometry import Geometry, travels
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds
 from trirail.processes import poses
@@ -48,10 +49,12 @@ ABSENT = {errno.ENOENT, errno.ENOTDIR, errno.EBADF, errno.ELOOP}
 PARKED = msgspec.structs.replace(CONFIG, poses={"park": (0.0, 0.05, 0.0)})
 
 
-def record(pose: tuple[float, float, float] = POSE, mode: Mode = Mode.HOLDING, homed: int = 1) -> np.void:
+def record(
+    pose: tuple[float, float, float] = POSE, mode: Mode = Mode.HOLDING, homed: int = 1, robot: Geometry = GEOMETRY
+) -> np.void:
     made = np.zeros(1, DTYPE)[0]
     made["mode"], made["homed"] = MODES.index(mode), homed
-    made["pose"], made["position"] = pose, inverse(GEOMETRY, pose).position
+    made["pose"], made["position"] = pose, inverse(robot, pose).position
     return made  # type: ignore[no-any-return]
 
 
@@ -134,6 +137,44 @@ def test_a_pose_that_was_taught_with_another_geometry_is_flagged_until_it_is_tau
     calibrated.teach("pick")
     assert not any(pose.other_geometry for pose in calibrated.poses.table().poses)
     assert calibrated.poses.warnings() == ()
+
+
+def with_map(x: float, made: str = "2026-05-01") -> Config:
+    """Return a configuration with a correction of x, the same everywhere."""
+    limits = CONFIG.limits.platform
+    low, high = zip(*(limits.x, limits.y, limits.phi), strict=True)
+    nodes = np.full((4, 4, 4, 3), (x, 0.0, 0.0)).tolist()
+    errors = AsBuilt(made, geometry_of(GEOMETRY), low, high, nodes)
+    return msgspec.structs.replace(CONFIG, correction=msgspec.structs.replace(CONFIG.correction, as_built=errors))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "is_other"),
+    [
+        (CONFIG, with_map(0.002), True),
+        (with_map(0.002), CONFIG, True),
+        (with_map(0.002), with_map(0.001), True),
+        (with_map(0.002), with_map(0.002, "2026-06-01"), False),
+    ],
+)
+def test_a_pose_that_was_taught_with_another_map_is_flagged(
+    make: Make, before: Config, after: Config, is_other: bool
+) -> None:
+    make(before).teach("pick", record(robot=corrected_geometry(before)))
+    (pick,) = make(after).poses.table().poses
+    assert pick.other_geometry == is_other
+    assert [("or correction map: pick;" in line) for line in make(after).poses.warnings()] == [True] * is_other
+
+
+def test_a_pose_of_a_file_that_names_only_the_geometry_was_taught_without_a_map(make: Make, tmp_path: Path) -> None:
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / NAME).write_text(json.dumps({"pick": [*POSE, geometry_of(GEOMETRY)], "old": POSE}))
+    assert {pose.name: pose.other_geometry for pose in make(CONFIG).poses.table().poses} == {
+        "pick": False,
+        "old": False,
+    }
+    flags = {pose.name: pose.other_geometry for pose in make(with_map(0.002)).poses.table().poses}
+    assert flags == {"pick": True, "old": False}
 
 
 def test_a_pose_is_taught_where_the_next_record_has_the_robot_and_kept(make: Make) -> None:

@@ -82,6 +82,15 @@ def geometry_of(robot: Geometry) -> str:
     return f"{zlib.crc32(numbers.tobytes() + kind):08x}"
 
 
+def corrected_geometry_of(robot: Geometry, as_built: AsBuilt | None) -> str:
+    """Return a checksum of a geometry with its map, by the numbers of both; without a map, that of the geometry."""
+    if as_built is None:
+        return geometry_of(robot)
+    numbers = np.hstack([np.ravel(part) for part in (as_built.low, as_built.high, as_built.nodes)])
+    shape = np.array(np.shape(as_built.nodes))
+    return f"{geometry_of(robot)}-{zlib.crc32((np.round(numbers, 9) + 0.0).tobytes() + shape.tobytes()):08x}"
+
+
 def correction(as_built: AsBuilt) -> Correction:
     """Return the map as a correction of poses. Raises ConfigError if its nodes are invalid."""
     try:

@@ -31,7 +31,8 @@ class TaughtPose(NamedTuple):
     phi: Coordinate
     """[rad]."""
     geometry: str = ""
-    """Checksum of the [geometry] section with which the pose was taught; "" in files of earlier versions."""
+    """Checksum of the [geometry] and of the correction map with which the pose was taught, from
+    `corrected_geometry_of`; "" in files of earlier versions."""
 
     @property
     def pose(self) -> Coordinates:

@@ -88,7 +88,7 @@ class Poses:
         again: bool = False,
     ) -> None:
         self._geometry = corrected_geometry(config)
-        self._geometry_id = as_built.geometry_of(geometry(config.geometry))
+        self._geometry_id = as_built.corrected_geometry_of(geometry(config.geometry), config.correction.as_built)
         self._configured = config.poses
         self._file = PoseFile(state_directory(config.robot.name))
         self._lacking = ""
@@ -111,8 +111,8 @@ class Poses:
         both = sorted(self._taught.keys() & self._configured.keys())
         foreign = sorted(name for name in self._taught.keys() - both if self._is_foreign(self._taught[name]))
         other = (
-            f"poses taught with another [geometry]: {', '.join(foreign)}; check each with trirail goto NAME, then "
-            "repeat trirail teach NAME"
+            f"poses taught with another [geometry] or correction map: {', '.join(foreign)}; check each with trirail "
+            "goto NAME, then repeat trirail teach NAME"
         )
         return *filter(None, (self._lacking, self._gone, other if foreign else "")), *(
             f"pose {name} is defined in [poses], and the taught pose is not used: remove it with trirail forget {name}"

@@ -322,7 +322,8 @@ class NamedPose(Struct, frozen=True):
     """True if the pose was taught, so that it can be replaced or removed. False if the pose is from [poses] of the
     configuration."""
     other_geometry: bool = False
-    """True if the pose was taught when the service had another [geometry]. Check such a pose, and teach it again."""
+    """True if the pose was taught when the service had another [geometry] or another correction map. Check such a pose,
+    and teach it again."""
 
 
 class NamedPoses(Struct, frozen=True):
