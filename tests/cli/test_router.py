@@ -372,6 +372,15 @@ def test_a_routers_file_that_is_wrong_is_refused_with_its_name(text: str, said: 
     assert " - at " not in str(refused.value)
 
 
+def test_zenohd_finds_the_keys_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = 'robots = ["demo"]\n[zenoh]\nlisten = ["tls/127.0.0.1:7447"]\n[zenoh.tls]\ndirectory = "keys"'
+    (tmp_path / "router.toml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    tls = router.load(Path("router.toml")).zenoh.tls
+    assert tls is not None
+    assert tls.directory == str(tmp_path / "keys")
+
+
 @pytest.mark.parametrize("name", [ROBOTS[0], "north"])
 def test_a_robot_or_router_that_is_revoked_is_not_let_in(net: Net, tmp_path: Path, name: str) -> None:
     """Its certificate may be in anybody's hands: who has it would answer in its name."""

@@ -58,7 +58,7 @@ def load(path: Path) -> RouterConfig:
         raise ConfigError(str(error)) from error
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-    config = msgspec.structs.replace(config, zenoh=config.zenoh.beside(path.parent))
+    config = msgspec.structs.replace(config, zenoh=config.zenoh.beside(path.parent.absolute()))
     if not config.all_robots:
         raise ConfigError(f"{path}: robots, routers: name at least one robot")
     named = Counter([*config.all_robots, *config.routers, *config.zenoh.users])
