@@ -15,7 +15,7 @@ from cyclopts import CycloptsError
 from trirail.cli import app, doctor, key_folder, probes, terminal
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Tls, Zenoh
-from trirail.errors import ServiceError
+from trirail.errors import RefusedError, ServiceError
 from trirail.processes.session_guard import Guard
 from trirail.wire.certificates import AUTHORITY_DAYS, Pair, authority, issue
 from trirail.wire.credentials import Credentials, revoked
@@ -132,6 +132,23 @@ def test_who_is_revoked_is_never_made_again(here: Path) -> None:
         keys("add", "ann", "--role", "viewer")
 
 
+def test_a_user_whose_folder_was_moved_away_is_revoked_by_name(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keys("init")
+    keys("add", "ann", "--role", "viewer")
+    keys("add", "eva", "--role", "viewer")
+    (here / "keys/users/ann").rename(here / "her-machine")
+    capsys.readouterr()
+    assert keys("revoke", "ann") == 0
+    assert "keys has no folder of ann: check that this is the name" in capsys.readouterr().out
+    assert keys("revoke", "eva") == 0
+    assert "no folder" not in capsys.readouterr().out
+    with pytest.raises(RefusedError, match="not a valid name"):
+        keys("revoke", "bob\nmax")
+    assert revoked(here / "keys") == {"ann", "eva"}
+    with pytest.raises(ServiceError, match="ann was revoked"):
+        keys("add", "ann", "--role", "viewer")
+
+
 def test_what_there_is_is_listed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keys("init", "--robot", "demo")
     keys("add", "ann", "--role", "viewer")
@@ -153,7 +170,6 @@ def test_what_there_is_is_listed(here: Path, capsys: pytest.CaptureFixture[str])
         (("add", "ann", "--role", "viewer"), "users/ann already exists: extend the certificate with"),
         (("add", "demo", "--role", "viewer"), "demo is the name of the robot"),
         (("renew", "bob"), "there is no user bob"),
-        (("revoke", "bob"), "there is no user bob"),
         (("revoke", "demo"), "demo is the robot itself, and cannot be revoked"),
         (("list", "--folder", "none"), "none/cert.pem: No such file or directory"),
         (("add", "bob", "--role", "viewer", "--folder", "none"), "none/cert.pem: No such file or directory"),
@@ -270,7 +286,7 @@ def test_what_is_expired_and_who_has_no_certificate_stand_out(
     assert [(check.verdict, check.found) for check in told] == [
         ("warning", f"ann cannot connect: {troubles['ann']}"),
         ("warning", f"ghost cannot connect: {troubles['ghost'].replace('keys/users', f'{here}/keys/users')}"),
-        ("warning", "nobody has a role but no certificate"),
+        ("warning", "nobody has a role, but this machine has no copy of a certificate of nobody"),
     ]
     (here / "keys/ca-key.pem").unlink()  # the authority is on another machine
     assert doctor.without_certificate(Guard(config).users, probes.issued(config)) == []

@@ -59,7 +59,10 @@ def _connection_limits(config: Config, machine: Machine) -> list[Check]:
 
 
 def without_certificate(users: Mapping[str, Role], issued: Sequence[IssuedCertificate] | None) -> list[Check]:
-    """Return the users that have a role but no certificate, if the authority's folder is on this machine."""
+    """Return the users that have a role but no valid certificate in the authority's folder, if it is on this machine.
+
+    A user without a folder may have a certificate, because the folder may have been moved to the user's machine.
+    """
     if issued is None:
         return []
     known = {each.name: each for each in issued}
@@ -70,8 +73,8 @@ def without_certificate(users: Mapping[str, Role], issued: Sequence[IssuedCertif
                 Check(
                     "certificates",
                     "warning",
-                    f"{user} has a role but no certificate",
-                    f"trirail keys add {user} --role {role}",
+                    f"{user} has a role, but this machine has no copy of a certificate of {user}",
+                    f"if none was issued: trirail keys add {user} --role {role}",
                 )
             )
         elif trouble := known[user].trouble():

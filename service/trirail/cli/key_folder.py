@@ -98,14 +98,17 @@ class KeyFolder:
         return self._find(name)
 
     def revoke(self, user: str) -> None:
-        """Revoke a user's role and delete the user's folder."""
-        there = self._find(user)
-        if there.is_robot:
+        """Revoke a user's role and delete the user's folder, if it is still here.
+
+        Only the name counts: the folder may have been moved to the user's machine.
+        """
+        if user == self._robot().name:
             raise ServiceError(f"{user} is the robot itself, and cannot be revoked: create a new authority instead")
         names = sorted({*revoked(self.folder), user})
         _write(self.folder / REVOKED, "".join(f"{name}\n" for name in names).encode(), PUBLIC)
-        with _as_service_error():
-            rmtree(there.folder)
+        for there in [each for each in self.issued() if each.name == user]:
+            with _as_service_error():
+                rmtree(there.folder)
 
     def issued(self) -> list[IssuedCertificate]:
         """Return the certificates that were issued and not revoked: the robot's first, then the users' by name."""

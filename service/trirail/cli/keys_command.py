@@ -225,10 +225,14 @@ def revoke(user: str, /, *, folder: Folder = HERE, json: Json = False) -> int:
     """
     from trirail.cli.key_folder import KeyFolder
 
-    KeyFolder(folder).revoke(user)
+    keys = KeyFolder(folder)
+    is_here = any(each.name == user for each in keys.issued())
+    keys.revoke(check_name(user, "user"))
     if json:
         terminal.json({"user": user, "revoked": True})
         return 0
+    if not is_here:
+        terminal.print_line(f"{folder} has no folder of {user}: check that this is the name in the lost certificate")
     terminal.print_line(f"{user} no longer has a role wherever this {folder / 'revoked.txt'} is read")
     terminal.print_line(
         "copy it to the folder of [zenoh.tls] of every robot and router of this authority, and restart their services"
