@@ -20,10 +20,10 @@ from trirail.control.modes import ModeEvent
 from trirail.wire import packets
 from trirail.wire.messages import CommandReply
 from trirail.wire.packets import CommandDone, Refused
-from trirail.wire.vocabulary import Command, CommandContent, Mode, NoContent, Override
+from trirail.wire.vocabulary import Command, CommandContent, Mode, NoContent, Override, Role
 from trirail_drivers.interface import Feedback, PowerState
 
-GUIDE = Path(__file__).parents[2] / "service/talking.md"
+SERVICE = Path(__file__).parents[2] / "service"
 ARGUMENTS = {Command.OVERRIDE: (50.0,), Command.SET_OUTPUT: ("valve", True)}
 """Arguments of the commands that need some, for a client's method."""
 every_command = pytest.mark.parametrize("name", Command)
@@ -99,6 +99,18 @@ def test_what_a_command_may_carry_has_a_type_words_and_a_schema(name: Command) -
     assert (name.content is not NoContent) == (message_schemas.FOLDER / f"command-{name}.json").exists()
 
 
+def row_of(guide: str, first_cell: str) -> set[str]:
+    """Return the names in a row of a table."""
+    text = (SERVICE / guide).read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| {re.escape(first_cell)} \|.*$", text, re.MULTILINE)
+    return set(re.findall(r"`(\w+)`", row))
+
+
 def test_the_guide_names_every_command() -> None:
-    (row,) = re.findall(r"^\| `cmd/<user>/<name>` .*$", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)
-    assert {name for name in Command if f"`{name}`" not in row} == set()
+    assert set(Command) - row_of("talking.md", "`cmd/<user>/<name>`") == set()
+
+
+def test_the_table_of_roles_names_every_command_in_the_row_of_its_lowest_role() -> None:
+    rows = {role: row_of("network.md", role) for role in Role}
+    lowest = {name: [role for role in Role if name in rows[role]][:1] for name in Command}
+    assert lowest == {name: [name.role] for name in Command}
