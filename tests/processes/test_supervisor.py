@@ -9,6 +9,7 @@ import random
 import socket
 import tempfile
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from trirail.errors import ServiceError
 from trirail.kinematics.compiled import FUNCTIONS
 from trirail.processes import forked_processes, supervisor
 from trirail.processes.monitoring import Health
+from trirail.telemetry import provenance
 from trirail.wire.messages import Event
 from waiting import WITHIN
 
@@ -216,6 +218,29 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
         "up",
         f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; restarting it",
     ]
+
+
+def missing() -> str:
+    raise FileNotFoundError
+
+
+@pytest.mark.parametrize(
+    ("fingerprint", "warnings"), [(provenance.fingerprint, 0), (lambda: "another version", 1), (missing, 1)]
+)
+def test_a_restart_after_an_update_of_the_installed_files_is_warned_of_once(
+    run: Running, monkeypatch: pytest.MonkeyPatch, fingerprint: Callable[[], str], warnings: int
+) -> None:
+    assert provenance.software().source == provenance.fingerprint()
+    monkeypatch.setattr(provenance, "fingerprint", fingerprint)
+    run.ends(
+        1,
+        loop_1="ready(); beat_until(lambda: begun('gateway-3')); heartbeats.heart('loop').rest()",
+        gateway_1=DYING,
+        gateway_2=DYING,
+        gateway_3="ready()",
+    )
+    changed = "the files of trirail have changed since the start, and restarted processes may fail"
+    assert [words.startswith(changed) for words in run.told].count(True) == warnings
 
 
 def test_each_restart_of_a_gateway_waits_longer_than_the_one_before(

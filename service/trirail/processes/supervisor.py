@@ -25,6 +25,7 @@ from trirail.processes.operating_system import Signals, Starter, Watchdog, notif
 from trirail.processes.order import Order
 from trirail.processes.realtime import release_startup_memory
 from trirail.processes.sockets import raise_descriptor_limit
+from trirail.telemetry import provenance
 from trirail.wire import links
 from trirail.wire.credentials import Admission
 from trirail.wire.messages import Event, Level
@@ -130,6 +131,8 @@ class Supervisor:
         self._health = Health(self._heartbeats, config.period, CHECK_PERIOD_S)
         self._watchdog = Watchdog([self._heartbeats.heart(name) for name in WATCHED_BY_SYSTEMD])
         self._starter = Starter()
+        self._software = provenance.software()  # computed before the fork, so that restarted processes report the same
+        self._replaced = False
         self._newest_event = 0
         self._next_turn = 0.0
         self._progress_at = 0.0
@@ -320,6 +323,22 @@ class Supervisor:
             except OSError as error:  # no descriptor is free for the pipe
                 self._report(f"cannot restart the {name} ({error.strerror}): trying again in 1 s", "warning")
                 self._due[name] = time.monotonic() + 1.0
+            self._check_source()
+
+    def _check_source(self) -> None:
+        """Warn once if trirail's files have changed: a restarted process mixes them with the modules of the start."""
+        if self._replaced:
+            return
+        try:
+            self._replaced = provenance.fingerprint() != self._software.source
+        except OSError:  # a file is being replaced
+            self._replaced = True
+        if self._replaced:
+            words = (
+                "the files of trirail have changed since the start, and restarted processes may fail: restart the "
+                "service while the robot is at rest"
+            )
+            self._report(words, "warning")
 
     def _fail(self, reason: str) -> None:
         self._failed = self._ending = True

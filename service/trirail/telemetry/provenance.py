@@ -46,7 +46,7 @@ prepare(Software)
 @cache
 def software() -> Software:
     """Return the versions of the running software."""
-    return Software(version("trirail"), _fingerprint(), f"{platform.system()} {platform.machine()}", versions())
+    return Software(version("trirail"), fingerprint(), f"{platform.system()} {platform.machine()}", versions())
 
 
 def versions() -> dict[str, str]:
@@ -139,7 +139,8 @@ def sources() -> Iterator[Path]:
         yield from sorted(package.rglob("*.py"))
 
 
-def _fingerprint() -> str:
+def fingerprint() -> str:
+    """Return a hash of the source files of both packages as they are on the disk now. Raises OSError."""
     digest = hashlib.sha256()
     for path in sources():
         package = next(package for package in _PACKAGES if path.is_relative_to(package))
