@@ -475,6 +475,37 @@ def test_a_gateway_that_is_started_again_goes_on_without_what_cannot_be_read_and
     assert make(PARKED, again=True).known().keys() == {"park", "pick"}
 
 
+@pytest.mark.parametrize("code", [errno.EIO, errno.EMFILE])
+def test_a_gateway_that_is_started_again_waits_for_a_file_that_the_system_cannot_read(
+    make: Make, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    make(PARKED).teach("pick")
+    path = state_directory("demo") / NAME
+    before, opened = path.read_bytes(), open
+
+    def fails(file: object, *arguments: Any, **more: Any) -> Any:
+        if file == path:
+            raise OSError(code, os.strerror(code), str(path))
+        return opened(file, *arguments, **more)  # type: ignore[call-overload]
+
+    with monkeypatch.context() as broken:
+        broken.setattr("builtins.open", fails)
+        later = make(PARKED, again=True)
+        (warning,) = later.poses.warnings()
+        assert "; no taught poses are available now; the file is read again" in warning
+        later.look()
+        assert later.known() == PARKED.poses
+        later.teach("place")
+        assert [refusal.code for refusal in later.refusals] == [RefusalCode.FAILED]
+    assert path.read_bytes() == before
+    later.teach("place")  # before the file is read again
+    later.now = 100.0
+    later.look()
+    assert later.known().keys() == {"park", "pick", "place"}
+    assert later.poses.warnings() == ()
+    assert make(PARKED).known().keys() == {"park", "pick", "place"}
+
+
 def test_a_change_is_told_to_everyone(rig: Rig) -> None:
     rig.cycle(Announcement(Notice("pose", "info", "pose pick removed by ann", user="ann")))
     (notice,) = [notice for notice in rig.notices if notice.kind == "pose"]

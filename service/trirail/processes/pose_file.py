@@ -57,6 +57,12 @@ def state_directory(robot: str) -> Path:
     return Path(base) / "trirail" / robot
 
 
+def may_pass(error: ServiceError) -> bool:
+    """Return True if the system could not read the file, so that its content may be valid."""
+    cause = error.__cause__
+    return isinstance(cause.__cause__ if isinstance(cause, FileError) else cause, OSError)
+
+
 class PoseFile:
     """File of taught poses. `read` and `change` raise ServiceError, whose message contains the path of the file."""
 

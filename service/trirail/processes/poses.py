@@ -23,7 +23,7 @@ from trirail.config import Config, as_built, corrected_geometry, geometry
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.kinematics.geometry import travels
 from trirail.processes.incoming import Incoming
-from trirail.processes.pose_file import PoseFile, Taught, TaughtPose, state_directory
+from trirail.processes.pose_file import PoseFile, Taught, TaughtPose, may_pass, state_directory
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goals import Coordinates, Goal, NamedGoal
 from trirail.wire.kinds.pose import pose_in_place_of
@@ -66,8 +66,8 @@ class Poses:
     wake
         Function that makes the gateway call `settle` soon. It may be called from any thread.
     again
-        True if the gateway is being restarted. If the file of taught poses cannot be read, a restarted gateway renames
-        the file and serves the robot without taught poses.
+        True if the gateway is being restarted. If the file of taught poses is invalid, a restarted gateway renames the
+        file and serves the robot without taught poses. If the system cannot read the file, the gateway tries it again.
 
     Raises
     ------
@@ -93,6 +93,8 @@ class Poses:
         self._file = PoseFile(state_directory(config.robot.name))
         self._lacking = ""
         """Reason why the taught poses are missing; empty if the file has been read."""
+        self._unread = False
+        """True while the file may be valid but has not been read."""
         self._taught = self._read(again=again)
         self._reply, self._refuse, self._announce, self._wake = reply, refuse, announce, wake
         self._to_measure: deque[_Change] = deque()
@@ -133,8 +135,10 @@ class Poses:
             self._lacking_announced = True
         self._writer.submit(self._check_file)
 
-    def _on_checked(self, *, is_gone: bool) -> None:
-        """Announce the loss of the file of taught poses, once."""
+    def _on_checked(self, taught: Taught | None, *, is_gone: bool) -> None:
+        """Use the poses of a file that could not be read before, and announce the loss of the file once."""
+        if taught is not None:
+            self._taught, self._unread, self._lacking = taught, False, ""
         self._next_check = self._clock() + CHECK_PERIOD_S
         before, self._gone = self._gone, self._lost_warning() if is_gone and not self._lacking else ""
         if self._gone and not before:
@@ -148,6 +152,10 @@ class Poses:
             if not again:
                 raise
             self._lacking = f"{error}; no taught poses are available now"
+            self._unread = may_pass(error)
+            if self._unread:
+                self._lacking += f"; the file is read again every {CHECK_PERIOD_S:g} s"
+                return {}
             with contextlib.suppress(OSError):  # if the file cannot be renamed, changes of poses will be refused
                 self._lacking += f"; the file is kept as {self._file.set_aside()}"
             return {}
@@ -230,7 +238,8 @@ class Poses:
             self._taught[change.name] = pose
         else:
             del self._taught[change.name]
-        self._lacking = ""  # the file now has every taught pose
+        if not self._unread:
+            self._lacking = ""  # the file now has every taught pose
         self._reply(change.incoming, self._named(change.name, pose))
         text = _words(change)
         self._announce(Notice("pose", "info", text.text, user=change.user, **text.fields))
@@ -286,8 +295,12 @@ class Poses:
         self._wake()
 
     def _check_file(self) -> None:
-        """Check that the file exists. This method runs in the writer's thread."""
-        self._finished.put(partial(self._on_checked, is_gone=self._file.is_gone()))
+        """Check that the file exists, and read it if that has failed. This method runs in the writer's thread."""
+        taught = None
+        if self._unread:
+            with contextlib.suppress(ServiceError):
+                taught = self._file.read()
+        self._finished.put(partial(self._on_checked, taught, is_gone=self._file.is_gone()))
         self._wake()
 
 
