@@ -243,7 +243,7 @@ def test_the_end_is_told_thirty_days_before(here: Path) -> None:
     assert credentials.warning(credentials.expires - timedelta(days=30, minutes=1)) == ""
     said = credentials.warning(credentials.expires - timedelta(days=29, hours=23))
     assert said.endswith("users/ann: expires in 29 days; renew it with: trirail keys renew")
-    for left, words in ((timedelta(hours=23, minutes=30), "23.5 hours"), (timedelta(minutes=-1), "0.0 hours")):
+    for left, words in ((timedelta(hours=23, minutes=30), "23 h 30 min"), (timedelta(minutes=-1), "0 h 0 min")):
         assert f" expires in {words};" in credentials.warning(credentials.expires - left)
     with pytest.raises(ServiceError, match="expired on"):
         Credentials.read(here / "keys/users/ann", credentials.expires + timedelta(seconds=1))

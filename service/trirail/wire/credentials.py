@@ -113,8 +113,8 @@ class Credentials(NamedTuple):
         left = self.expires - (now or datetime.now(UTC))
         if left > EXPIRY_NOTICE:
             return ""
-        hours = max(0.0, left / timedelta(hours=1))
-        within = f"{left.days} days" if left.days > 0 else f"{hours:.1f} hours"
+        hours, minutes = divmod(max(0, left // timedelta(minutes=1)), 60)
+        within = f"{left.days} days" if left.days > 0 else f"{hours} h {minutes} min"
         return f"certificate in {self.folder}: expires in {within}; renew it with: trirail keys renew"
 
 
