@@ -149,6 +149,38 @@ def test_a_user_whose_folder_was_moved_away_is_revoked_by_name(here: Path, capsy
         keys("add", "ann", "--role", "viewer")
 
 
+def test_an_authority_whose_robot_has_its_certificate_elsewhere_serves_all_users(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys("init", "--robot", "demo")
+    (here / "usb").mkdir()
+    for name in ("ca.pem", "ca-key.pem"):
+        (here / "keys" / name).rename(here / "usb" / name)
+    away = ("--folder", "usb")
+    assert keys("add", "ann", "--role", "viewer", *away) == 0
+    assert keys("renew", "ann", *away) == 0
+    for words in (("add", "demo", "--role", "viewer"), ("revoke", "demo")):
+        with pytest.raises(ServiceError, match="demo is the "):
+            keys(*words, *away)
+    capsys.readouterr()
+    assert keys("list", "--json", *away) == 0
+    assert [each["name"] for each in json.loads(capsys.readouterr().out)["certificates"]] == ["ann"]
+    assert keys("revoke", "ann", *away) == 0
+    assert revoked(here / "usb") == {"ann"}
+
+
+def test_a_damaged_certificate_of_one_user_does_not_keep_others_from_being_revoked(here: Path) -> None:
+    keys("init")
+    for name in ("ann", "bob"):
+        keys("add", name, "--role", "viewer")
+    (here / "keys/users/ann/cert.pem").write_bytes(b"-----BEGIN CERT")
+    assert keys("renew", "bob") == 0
+    assert keys("revoke", "bob") == 0
+    assert keys("revoke", "ann") == 0
+    assert revoked(here / "keys") == {"ann", "bob"}
+    assert list((here / "keys/users").iterdir()) == []
+
+
 def test_what_there_is_is_listed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keys("init", "--robot", "demo")
     keys("add", "ann", "--role", "viewer")
@@ -263,6 +295,9 @@ def test_what_is_expired_and_who_has_no_certificate_stand_out(
     past = issue(by, "ann", 1.0, now=datetime.now(UTC) - timedelta(days=2))
     (here / "keys/users/ann/cert.pem").write_bytes(past.certificate)
     (here / "keys/users/ghost").mkdir()
+    keys("add", "half", "--role", "viewer")
+    damaged = here / "keys/users/half/cert.pem"
+    damaged.write_bytes(damaged.read_bytes()[:100])
     capsys.readouterr()
     assert keys("list", "--json") == 0
     listed = {each["name"]: each for each in json.loads(capsys.readouterr().out)["certificates"]}
@@ -270,7 +305,8 @@ def test_what_is_expired_and_who_has_no_certificate_stand_out(
         "demo": "",
         "ann": "expired: trirail keys renew ann makes a new one",
         "bob": "",
-        "ghost": "no cert.pem: delete keys/users/ghost, then trirail keys add ghost --role ROLE",
+        "ghost": "no valid cert.pem: delete keys/users/ghost, then trirail keys add ghost --role ROLE",
+        "half": "no valid cert.pem: delete keys/users/half, then trirail keys add half --role ROLE",
         "left": "",
     }
     assert {name: each["trouble"] for name, each in listed.items()} == troubles

@@ -23,7 +23,7 @@ from cryptography import x509
 from trirail_drivers import files
 
 from trirail.errors import ServiceError
-from trirail.wire.certificates import Pair, authority, common_name, issue, renew, serves
+from trirail.wire.certificates import AUTHORITY_SUFFIX, Pair, authority, common_name, issue, renew, serves
 from trirail.wire.credentials import AUTHORITY, CERTIFICATE, KEY, REVOKED, Credentials, check_private, revoked
 
 AUTHORITY_KEY = "ca-key.pem"
@@ -32,7 +32,7 @@ PRIVATE, PUBLIC = 0o600, 0o644
 
 
 class IssuedCertificate(NamedTuple):
-    """A certificate that the authority has issued, or a folder that contains none."""
+    """A certificate that the authority has issued, or a folder that contains no valid one."""
 
     name: str
     is_robot: bool
@@ -40,13 +40,13 @@ class IssuedCertificate(NamedTuple):
     serves: bool
     """Whether the certificate belongs to any robot or router."""
     expires: datetime | None
-    """Expiry date; None if there is no certificate."""
+    """Expiry date; None if there is no valid certificate."""
     folder: Path
 
     def trouble(self, now: datetime | None = None) -> str:
         """Return the reason why the certificate cannot open a session, or "" if it can."""
         if self.expires is None:
-            return f"no {CERTIFICATE}: delete {self.folder}, then trirail keys add {self.name} --role ROLE"
+            return f"no valid {CERTIFICATE}: delete {self.folder}, then trirail keys add {self.name} --role ROLE"
         expired = self.expires < (now or datetime.now(UTC))
         return f"expired: trirail keys renew {self.name} makes a new one" if expired else ""
 
@@ -76,7 +76,7 @@ class KeyFolder:
         folder = self.folder / USERS / user
         if user in revoked(self.folder):
             raise ServiceError(f"{user} was revoked, and the lost certificate has this name: choose another name")
-        if user == self._robot().name:
+        if user in self._robot_names():
             raise ServiceError(f"{user} is the name of the robot: choose another name")
         if folder.exists():
             raise ServiceError(f"{folder} already exists: extend the certificate with trirail keys renew {user}")
@@ -102,7 +102,7 @@ class KeyFolder:
 
         Only the name counts: the folder may have been moved to the user's machine.
         """
-        if user == self._robot().name:
+        if user in self._robot_names():
             raise ServiceError(f"{user} is the robot itself, and cannot be revoked: create a new authority instead")
         names = sorted({*revoked(self.folder), user})
         _write(self.folder / REVOKED, "".join(f"{name}\n" for name in names).encode(), PUBLIC)
@@ -114,7 +114,7 @@ class KeyFolder:
         """Return the certificates that were issued and not revoked: the robot's first, then the users' by name."""
         folder = self.folder / USERS
         users = sorted(each for each in folder.iterdir() if each.name[0] != ".") if folder.exists() else []
-        return [self._robot(), *(_issued(each, is_robot=False) for each in users)]
+        return [*self._robot(), *(_issued(each, is_robot=False) for each in users)]
 
     def _find(self, name: str) -> IssuedCertificate:
         matches = [each for each in self.issued() if each.name == name]
@@ -122,8 +122,15 @@ class KeyFolder:
             raise ServiceError(f"{self.folder}: there is no user {name}; trirail keys list shows the users")
         return matches[0]
 
-    def _robot(self) -> IssuedCertificate:
-        return _issued(self.folder, is_robot=True)
+    def _robot(self) -> list[IssuedCertificate]:
+        """Return the robot's certificate, or nothing if an authority on another machine has only its own files."""
+        kept_elsewhere = (self.folder / AUTHORITY_KEY).exists() and not (self.folder / CERTIFICATE).exists()
+        return [] if kept_elsewhere else [_issued(self.folder, is_robot=True)]
+
+    def _robot_names(self) -> set[str]:
+        """Return the name in the robot's certificate, and that for which the authority was created."""
+        names = {each.name for each in self._robot()}
+        return names | {common_name(_certificate(self.folder / AUTHORITY)).removesuffix(AUTHORITY_SUFFIX)}
 
     def _authority(self) -> Pair:
         pair = Pair(_read(self.folder / AUTHORITY), _read(self.folder / AUTHORITY_KEY))
@@ -139,9 +146,12 @@ class KeyFolder:
 
 def _issued(folder: Path, *, is_robot: bool) -> IssuedCertificate:
     file = folder / CERTIFICATE
-    if not is_robot and not file.exists():
+    try:
+        certificate = _certificate(file)
+    except ServiceError:
+        if is_robot:
+            raise
         return IssuedCertificate(folder.name, False, False, None, folder)
-    certificate = _certificate(file)
     return IssuedCertificate(
         common_name(certificate), is_robot, serves(certificate), certificate.not_valid_after_utc, folder
     )

@@ -18,6 +18,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 AUTHORITY_DAYS = 3650
 """Validity of an authority's certificate [days]."""
+AUTHORITY_SUFFIX = " authority"
+"""Text after the robot's name in the name of its authority."""
 LONGEST_ROBOT = 54
 """Maximum number of characters of the robot's name in that of its authority, since X.509 allows common names of 64."""
 CLOCK_TOLERANCE = timedelta(minutes=10)
@@ -34,7 +36,7 @@ class Pair(NamedTuple):
 def authority(robot: str, now: datetime | None = None) -> Pair:
     """Return a new authority, which consists of a self-signed certificate and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = _name(f"{robot[:LONGEST_ROBOT]} authority")
+    name = _name(f"{robot[:LONGEST_ROBOT]}{AUTHORITY_SUFFIX}")
     builder = (
         _builder(name, key.public_key(), now or datetime.now(UTC), AUTHORITY_DAYS)
         .issuer_name(name)
