@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import threading
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import msgspec
@@ -16,9 +17,11 @@ from refusals import refused_as
 from trirail.client import async_client
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import GoalHandle, Robot
+from trirail.client.connection import Connection
 from trirail.client.goal import AsyncGoalHandle
 from trirail.errors import RefusalCode, ServiceError, WaitTimeoutError
 from trirail.wire import boundary, zenoh_session
+from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply, Event, RoleReply
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import Role
@@ -180,6 +183,20 @@ def test_the_users_of_a_robot_that_is_not_there_are_an_error(tmp_path: Path) -> 
     locator = f"unixsock-stream/{tmp_path}/zenoh"
     with open_service([locator]), Robot("demo", locator) as robot, pytest.raises(ServiceError, match="no robot 'demo'"):
         robot.users()
+
+
+@pytest.mark.parametrize(("left", "is_told"), [(timedelta(seconds=-1), True), (timedelta(days=1), False)])
+def test_no_answer_to_a_user_whose_certificate_has_expired_is_told_as_that(
+    tmp_path: Path, left: timedelta, is_told: bool
+) -> None:
+    """The service ends the session of such a user."""
+    locator = f"unixsock-stream/{tmp_path}/zenoh"
+    with open_service([locator]):
+        connection = Connection("demo", locator)
+        connection._credentials = Credentials(tmp_path / "ann", "ann", datetime.now(UTC) + left, ())
+        error = connection.why_nobody(("cmd", "ann", "stop"), None)
+        connection.close()
+    assert (f"the certificate in {tmp_path}/ann has expired; renew it" in str(error)) == is_told
 
 
 @pytest.mark.parametrize("token", ["\x1b[31mred", "two\nlines", "x" * 3000, "\u202eabc"])

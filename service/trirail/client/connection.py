@@ -9,7 +9,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
 
 import msgspec
@@ -249,6 +249,8 @@ class Connection:
         """Return the error message for a query without a reply; `why` is the supposed reason."""
         if is_starting(self._connect):
             why = "the service is starting; try again when it reports that it is up"
+        elif self._credentials is not None and self._credentials.expires <= datetime.now(UTC):
+            why = f"the certificate in {self._credentials.folder} has expired; renew it with: trirail keys renew"
         return f"no robot {self.robot!r} answers at {self._connect}: {why}"
 
     def _denied(self, parts: tuple[str, ...], user: str, role: str | None) -> RefusedError | None:
