@@ -8,17 +8,29 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import bus_log
+import msgspec
 import pytest
 from trirail import RefusedError, Robot
 from trirail.client import own_service
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.cia402 import canopen_frames as layout
+from trirail_drivers.interface import NAMES
+from trirail_drivers.odrive.flat_endpoints import KNOWN_TABLES, Endpoint, Version
+from trirail_drivers.odrive.protections import ABSOLUTE_SETPOINTS
+from trirail_drivers.simulated.odrive import FIRMWARE, HARDWARE
 from waiting import wait_until
 
 VIRTUAL_DRIVES = Path(__file__).parents[2] / "tools/virtual_drives.py"
 TURNS = "counts_per_metre = 25.0"
 """Unit of an ODrive's position: turns of a screw with 40 mm lead."""
 Tell = Callable[[str], None]
+
+
+def endpoints() -> bytes:
+    """A simulated ODrive's flat_endpoints.json, also with the setting that says if its position survives a restart."""
+    table = next(each for each in KNOWN_TABLES if each.matches(Version(HARDWARE, FIRMWARE)))
+    whole = table.endpoints | {ABSOLUTE_SETPOINTS: Endpoint(900, "bool")}
+    return msgspec.json.encode(msgspec.structs.replace(table, endpoints=whole))
 
 
 @pytest.fixture(params=["cia402", "odrive"])
@@ -33,6 +45,9 @@ def drives(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Pat
     assert "capture_can" in text
     if request.param == "odrive":
         text = text.replace('protocol = "cia402"', 'protocol = "odrive"').replace("counts_per_metre = 1e7", TURNS)
+        for name in NAMES:
+            text = text.replace(f"[drives.{name}]", f'[drives.{name}]\nendpoints = "a.json"')
+        (tmp_path / "a.json").write_bytes(endpoints())
     config.write_text(text)
     given = [str(config), "--interface", "unix", "--channel", str(bus)]
     with subprocess.Popen([sys.executable, str(VIRTUAL_DRIVES), *given], stdin=subprocess.PIPE) as process:

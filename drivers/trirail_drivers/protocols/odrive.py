@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 from trirail_drivers import config
 from trirail_drivers.bus.load import TrafficPlan
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
-from trirail_drivers.odrive import cansimple, checks
+from trirail_drivers.odrive import cansimple, checks, flat_endpoints
 from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.odrive.other_masters import check_exclusive
 from trirail_drivers.odrive.protections import PROTECTIONS, describe_protection
@@ -26,7 +27,7 @@ def _simulated_drive(
     simulated: config.Simulated, drives: config.Drives, drive: config.Drive, start: float
 ) -> SimulatedDevice:
     turns = drive.direction * (start - drive.offset) * drive.counts_per_metre
-    return SimulatedOdrive(
+    device = SimulatedOdrive(
         drive.node,
         Servo.configured(simulated, drive, turns),
         heartbeat=drives.heartbeat,
@@ -34,6 +35,9 @@ def _simulated_drive(
         # A CiA 402 drive waits for its master as long as this. CANSimple has no message that sets the time.
         watchdog=MISSED_HEARTBEATS * drives.heartbeat,
     )
+    if drive.endpoints is not None:
+        device.tables = flat_endpoints.read(f"node {drive.node}", Path(drive.endpoints)), *device.tables
+    return device
 
 
 def _plan_traffic(

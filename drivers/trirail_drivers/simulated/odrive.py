@@ -72,6 +72,8 @@ class SimulatedOdrive:
         self.modes = (VELOCITY_CONTROL, cansimple.PASSTHROUGH)
         """Control mode and input mode. The initial modes are wrong, as if another client had set them."""
         self.version = Version(HARDWARE, FIRMWARE)
+        self.tables = KNOWN_TABLES
+        """Tables of endpoint numbers, among which is that of the drive's firmware."""
         self.serial = 0x3664_0000_0000 + node
         self.settings: dict[str, float] = {
             "axis0.config.enable_watchdog": watchdog < NO_TIMEOUT,
@@ -227,7 +229,7 @@ class SimulatedOdrive:
     def _sdo(self, data: bytes) -> None:
         """Read or write a setting (RxSdo). There is no answer to endpoint numbers of other firmware versions."""
         opcode, number, _ = cansimple.SDO.unpack_from(data)
-        table = next((table.endpoints for table in KNOWN_TABLES if table.matches(self.version)), {})
+        table = next((table.endpoints for table in self.tables if table.matches(self.version)), {})
         for path, endpoint in table.items():
             if endpoint.id != number or path not in self.settings:
                 continue
