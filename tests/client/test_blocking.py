@@ -422,6 +422,20 @@ def test_a_command_that_a_stop_overtakes_on_its_way_is_followed_by_that_stop(
                 assert str(again.key_expr) == f"trirail/demo/cmd/ann/{stop}"
 
 
+@pytest.mark.parametrize("stop", STOPS)
+def test_a_stop_that_is_not_confirmed_yet_is_sent_again_after_a_command(robot: Robot, slow: Slow, stop: str) -> None:
+    sending = Call(lambda: robot.command("enable"))
+    late = slow.next()
+    stopping = Call(lambda: robot.command(stop))
+    unanswered = slow.next()
+    reply(late, CommandReply("enable", "holding", 2))
+    sending.end()
+    with slow.next() as again:
+        assert str(again.key_expr) == f"trirail/demo/cmd/ann/{stop}"
+    reply(unanswered, CommandReply(stop, "disabled", 1))
+    stopping.end()
+
+
 @pytest.mark.parametrize("name", ["pause", "the stop of another goal"])
 def test_a_goal_under_way_outlives_what_does_not_stop_it(robot: Robot, slow: Slow, name: str) -> None:
     with congested(robot):

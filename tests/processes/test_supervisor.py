@@ -224,8 +224,13 @@ def missing() -> str:
     raise FileNotFoundError
 
 
+def unreadable() -> str:
+    raise OSError(errno.EMFILE, "Too many open files")
+
+
 @pytest.mark.parametrize(
-    ("fingerprint", "warnings"), [(provenance.fingerprint, 0), (lambda: "another version", 1), (missing, 1)]
+    ("fingerprint", "warnings"),
+    [(provenance.fingerprint, 0), (lambda: "another version", 1), (missing, 1), (unreadable, 0)],
 )
 def test_a_restart_after_an_update_of_the_installed_files_is_warned_of_once(
     run: Running, monkeypatch: pytest.MonkeyPatch, fingerprint: Callable[[], str], warnings: int

@@ -148,8 +148,8 @@ def _issued(folder: Path, *, is_robot: bool) -> IssuedCertificate:
     file = folder / CERTIFICATE
     try:
         certificate = _certificate(file)
-    except ServiceError:
-        if is_robot:
+    except ServiceError as error:
+        if is_robot or isinstance(error.__cause__, PermissionError):
             raise
         return IssuedCertificate(folder.name, False, False, None, folder)
     return IssuedCertificate(

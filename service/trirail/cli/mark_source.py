@@ -127,7 +127,7 @@ def _excerpt(printed: bytes) -> str:
 
 def _end_group(process: subprocess.Popen[bytes]) -> None:
     """End a process and its children, which could keep a camera open."""
-    with contextlib.suppress(ProcessLookupError):  # the group has no process any more
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # no process is left, or it belongs to another user
         os.killpg(process.pid, signal.SIGTERM)
         deadline = time.monotonic() + EXIT_TIMEOUT_S
         while time.monotonic() < deadline:

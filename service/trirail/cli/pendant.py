@@ -209,7 +209,7 @@ def _serve(pendant: Pendant, newest: _StateReader, display: Live) -> None:
         stalled = now - last > STALL_S  # stopped and continued
         if stalled:
             pendant.release_key()
-        typed, begun = begun, b""  # if nothing follows, this is the key Escape
+        typed, begun, more = begun, b"", b""  # if nothing follows, this is the key Escape
         if descriptor in ready:
             if not (more := os.read(descriptor, MAX_BUFFERED)):
                 return  # the terminal is gone
@@ -218,7 +218,8 @@ def _serve(pendant: Pendant, newest: _StateReader, display: Live) -> None:
             if not stalled or key in (*STOP_KEYS, "q"):
                 pendant.press(key, now)
         pendant.tick(now)
-        last = now
+        if not (stalled and len(more) > MAX_BUFFERED // 2):  # the kernel has more stale input
+            last = now
         # Scroll Lock of a console suspends the output, in which writing would wait.
         if now - drawn > REDRAW_S and select.select([], [sys.stdout], [], 0.0)[1]:
             state, before = newest.state, mode

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable
@@ -26,8 +27,9 @@ def stopping(name: Command) -> Callable[..., int]:
         words = f"{name}: no answer from {service.connect} yet; still trying, Ctrl-C gives up"
         silence = Timer(ANSWER_S, terminal.print_error, (words,))
         silence.daemon = True
-        silence.start()
         try:
+            with contextlib.suppress(RuntimeError):  # no thread can be started
+                silence.start()
             reply = asked.wait()
             silence.cancel()
             confirmed(service, name, reply)

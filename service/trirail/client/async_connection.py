@@ -132,7 +132,7 @@ class AsyncConnection:
         self._connection.forget_pause(until)
 
     def overtaking_stops(self, began: float, cycle: int) -> set[Command]:
-        """Return the stops that were called later than `began` [s], but took effect before a `cycle`."""
+        """Return the stops that were called later than `began` [s], but may have taken effect before a `cycle`."""
         return self._connection.overtaking_stops(began, cycle)
 
     def later_stops(self, began: float) -> set[Command]:

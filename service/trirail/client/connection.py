@@ -83,8 +83,8 @@ class Connection:
         self._known = 0, 0.0
         self._stopped_at = {name: -math.inf for name in Command if name.stops}
         """Time of the newest call of each command that stops the robot, on the monotonic clock [s]."""
-        self._stop_cycles = dict.fromkeys(self._stopped_at, math.inf)
-        """Cycle in which the newest call of each of these commands took effect; infinite if it is not confirmed."""
+        self._stop_cycles = dict.fromkeys(self._stopped_at, -math.inf)
+        """Cycle in which the newest call of each of these commands took effect; -inf if it is not confirmed."""
         self._here = self._opened.liveliness().declare_token(self.key("here", user)) if user is not None else None
 
     @property
@@ -163,7 +163,7 @@ class Connection:
     def note_stop(self, name: Command) -> float:
         """Store the time of the present call, which stops the robot; return that time [s]."""
         at = called_at()
-        self._stopped_at[name], self._stop_cycles[name] = max(self._stopped_at[name], at), math.inf
+        self._stopped_at[name], self._stop_cycles[name] = max(self._stopped_at[name], at), -math.inf
         return at
 
     def confirm_stop(self, name: Command, cycle: int) -> None:
@@ -176,7 +176,7 @@ class Connection:
             self._stopped_at[Command.PAUSE] = -math.inf
 
     def overtaking_stops(self, began: float, cycle: int) -> set[Command]:
-        """Return the stops that were called later than `began` [s], but took effect before a `cycle`."""
+        """Return the stops that were called later than `began` [s], but may have taken effect before a `cycle`."""
         return {name for name in self.later_stops(began) if self._stop_cycles[name] < cycle}
 
     def later_stops(self, began: float) -> set[Command]:

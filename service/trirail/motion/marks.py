@@ -205,6 +205,7 @@ class _Trace:
         k, axis = np.nonzero(turns)
         low, high, before = times[k], times[k + 1], np.sign(rates[k, axis])
         for _ in range(BISECTIONS if len(k) else 0):
+            self._beat()
             middle = (low + high) / 2.0
             same = np.sign(self.states(middle)[1][np.arange(len(k)), axis]) == before
             low, high = np.where(same, middle, low), np.where(same, high, middle)

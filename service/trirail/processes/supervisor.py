@@ -331,8 +331,10 @@ class Supervisor:
             return
         try:
             self._replaced = provenance.fingerprint() != self._software.source
-        except OSError:  # a file is being replaced
+        except FileNotFoundError:  # a file is being replaced
             self._replaced = True
+        except OSError:  # for example, no descriptor is free
+            return
         if self._replaced:
             words = (
                 "the files of trirail have changed since the start, and restarted processes may fail: restart the "
