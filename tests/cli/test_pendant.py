@@ -119,6 +119,19 @@ def test_keys_typed_during_a_stall_are_stale_but_a_stop_is_not(
     assert hand.released
 
 
+def test_keys_beyond_what_one_read_returns_are_as_stale(
+    tty_pair: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.write(tty_pair[0], b"a")  # stays there, so that there is something to read
+    reads = iter((b"a" * pendant.MAX_BUFFERED, b"aa q"))
+    passes = iter((0.0, 2.0 * pendant.STALL_S, 2.0 * pendant.STALL_S + 0.01))
+    monkeypatch.setattr(pendant, "time", SimpleNamespace(monotonic=lambda: next(passes)))
+    monkeypatch.setattr(pendant, "os", SimpleNamespace(read=lambda *_: next(reads)))
+    hand = Hand()
+    pendant._serve(hand, SimpleNamespace(state=None), SimpleNamespace(update=lambda *_, **__: None))  # type: ignore[arg-type]
+    assert hand.pressed == [" ", "q"]
+
+
 def test_keys_work_while_the_output_is_suspended(tty_pair: tuple[int, int]) -> None:
     """By Scroll Lock of a console: what is written then waits."""
     keyboard, terminal = tty_pair

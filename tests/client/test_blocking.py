@@ -334,22 +334,26 @@ def test_what_a_signal_handler_sends_after_its_stop_is_sent(
     pressing.join()
 
 
-@pytest.mark.parametrize("taken_back", ["resumed", "refused"])
-def test_a_path_begins_after_a_pause_that_was_taken_back_on_the_way_to_its_first_point(
-    robot: Robot, slow: Slow, monkeypatch: pytest.MonkeyPatch, taken_back: str
-) -> None:
-    arrived, go_on = threading.Event(), threading.Event()
-
-    def check(_: object) -> None:
-        arrived.set()
-        assert go_on.wait(WITHIN)
-
-    monkeypatch.setattr(async_client, "check_arrived", check)
+def on_the_way(robot: Robot, slow: Slow) -> tuple[Call, str]:
+    """Follow a path, and accept the goal at its first point; return the call, and the id of this goal."""
     following = Call(lambda: robot.follow([(0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 0.0, 0.0)], go_there=True))
     way = slow.next()
     assert way.payload is not None
     goal_id = msgspec.json.decode(way.payload.to_bytes())["id"]
     reply(way, GoalReply(goal_id, 1.0))
+    return following, goal_id
+
+
+def end_goal(slow: Slow, goal_id: str) -> None:
+    ended = Event("goal", "info", "done", id=goal_id, outcome="done", seq=1, t=0.0, cycle=0, time=1.0)
+    slow.session.put("trirail/demo/event", msgspec.json.encode(ended))
+
+
+@pytest.mark.parametrize("taken_back", ["resumed", "refused"])
+def test_a_path_begins_after_a_pause_that_was_taken_back_on_the_way_to_its_first_point(
+    robot: Robot, slow: Slow, taken_back: str
+) -> None:
+    following, goal_id = on_the_way(robot, slow)
     pausing = Call(robot.pause)
     with slow.next() as query:
         if taken_back == "resumed":
@@ -361,10 +365,7 @@ def test_a_path_begins_after_a_pause_that_was_taken_back_on_the_way_to_its_first
         resuming = Call(robot.resume)
         reply(slow.next(), CommandReply("resume", "moving", 2))
         resuming.end()
-    ended = Event("goal", "info", "done", id=goal_id, outcome="done", seq=1, t=0.0, cycle=0, time=1.0)
-    slow.session.put("trirail/demo/event", msgspec.json.encode(ended))
-    assert arrived.wait(WITHIN)
-    go_on.set()
+    end_goal(slow, goal_id)
     path = slow.next()
     assert str(path.key_expr).startswith("trirail/demo/goal/ann")
     reply(path, GoalReply("p", 1.0))
@@ -381,13 +382,8 @@ def test_a_path_does_not_begin_after_a_stop_that_came_when_its_first_point_was_r
         assert go_on.wait(WITHIN)
 
     monkeypatch.setattr(async_client, "check_arrived", check)
-    following = Call(lambda: robot.follow([(0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 0.0, 0.0)], go_there=True))
-    way = slow.next()
-    assert way.payload is not None
-    goal_id = msgspec.json.decode(way.payload.to_bytes())["id"]
-    reply(way, GoalReply(goal_id, 1.0))
-    ended = Event("goal", "info", "done", id=goal_id, outcome="done", seq=1, t=0.0, cycle=0, time=1.0)
-    slow.session.put("trirail/demo/event", msgspec.json.encode(ended))
+    following, goal_id = on_the_way(robot, slow)
+    end_goal(slow, goal_id)
     assert arrived.wait(WITHIN)
     stop_and_confirm(robot, slow)
     go_on.set()
