@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import itertools
 import operator
 import os
@@ -28,6 +29,7 @@ from trirail.client.connection import Connection
 from trirail.client.new_stop import NewStop
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import zenoh_session
+from trirail.wire.call_mark import CallMark, mark_in
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply
 from trirail.wire.stop_protocol import STOPS
@@ -390,46 +392,23 @@ def test_a_path_does_not_begin_after_a_stop_that_came_when_its_first_point_was_r
     assert (following.end().code, slow.asked.qsize()) == (RefusalCode.STOPPED, 0)
 
 
-def test_a_goal_that_a_stop_overtakes_on_its_way_is_stopped_when_it_is_accepted(robot: Robot, slow: Slow) -> None:
-    """The stop port is another way than that of the goal."""
-    sending = Call(lambda: robot.move_to(0.01, 0.0, 0.0, id="g"))
-    late = slow.next()
-    stop_and_confirm(robot, slow)
-    reply(late, GoalReply("g", 1.0))
-    assert sending.end().id == "g"
-    with slow.next() as stop:
-        assert stop.payload is not None
-        assert f"{stop.key_expr} {stop.payload.to_string()}" == 'trirail/demo/cmd/ann/stop {"goal":"g"}'
-
-
-@pytest.mark.parametrize("name", [name for name in Command if name.starts])
-@pytest.mark.parametrize("stop", STOPS)
-def test_a_command_that_a_stop_overtakes_on_its_way_is_followed_by_that_stop(
+@pytest.mark.parametrize("stop", STOPPING)
+@pytest.mark.parametrize("name", STARTING)
+def test_the_service_sees_which_requests_were_called_for_before_a_stop(
     robot: Robot, slow: Slow, name: str, stop: str
 ) -> None:
-    for cycle, overtaken in ((0, False), (2, True)):
-        sending = Call(lambda: robot.command(name))
-        late = slow.next()
-        stop_and_confirm(robot, slow, stop)
-        reply(late, CommandReply(name, "holding", cycle))
-        assert sending.end().mode == "holding"
-        if overtaken:
-            with slow.next() as again:
-                assert str(again.key_expr) == f"trirail/demo/cmd/ann/{stop}"
-
-
-@pytest.mark.parametrize("stop", STOPS)
-def test_a_stop_that_is_not_confirmed_yet_is_sent_again_after_a_command(robot: Robot, slow: Slow, stop: str) -> None:
-    sending = Call(lambda: robot.command("enable"))
-    late = slow.next()
-    stopping = Call(lambda: robot.command(stop))
-    unanswered = slow.next()
-    reply(late, CommandReply("enable", "holding", 2))
-    sending.end()
-    with slow.next() as again:
-        assert str(again.key_expr) == f"trirail/demo/cmd/ann/{stop}"
-    reply(unanswered, CommandReply(stop, "disabled", 1))
-    stopping.end()
+    """The stop may overtake them, since it is also sent to the stop port."""
+    marks: list[CallMark | None] = []
+    for do in (STARTING[name], STOPPING[stop], STARTING[name]):
+        calling = Call(functools.partial(do, robot))
+        with slow.next() as query:
+            assert query.attachment is not None
+            marks.append(mark_in(query.attachment.to_string()))
+            query.reply_err(msgspec.json.encode(ErrorReply(RefusalCode.BUSY, "busy")))
+        calling.end()
+    first, second, third = filter(None, marks)
+    assert first.connection == second.connection == third.connection
+    assert first.called_ns < second.called_ns < third.called_ns
 
 
 @pytest.mark.parametrize("name", ["pause", "the stop of another goal"])

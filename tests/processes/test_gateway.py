@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+import random
 import subprocess
 import sys
 import threading
@@ -23,6 +24,7 @@ from trirail.processes.replies import REFUSALS_OF_USER
 from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER, REPLY_TIMEOUT_S
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
+from trirail.wire.call_mark import CallMark, new_connection
 from trirail.wire.event_codes import EventCode
 from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 from trirail.wire.kinds.trajectory import parts
@@ -264,6 +266,31 @@ def test_a_stop_that_overtook_goals_withdraws_them_and_none_that_came_later(rig:
     for number, user in ((3, "ann"), (4, "bob"), (6, "ann"), (7, "eve")):
         rig.goal(f"g{number}", user, number)
     assert rig.goals() == [("g3", "stop by ann"), ("g4", "stop by ann"), ("g6", None), ("g7", None)]
+
+
+@pytest.mark.generated(*range(8))
+def test_what_was_called_for_before_a_stop_of_its_connection_is_not_carried_out_after_it(rig: Rig, seed: int) -> None:
+    chance = random.Random(seed)
+    connections, stopped = [new_connection() for _ in range(3)], {"": 0}
+    for number in range(1, 60):
+        mark = CallMark(chance.choice(connections), chance.randrange(1, 1000))
+        is_marked, name = chance.random() < 0.8, chance.choice(["goal", "enable", "resume", "stop", "pause", "one"])
+        content = b'{"goal": "other"}' if name == "one" else b""
+        if name == "goal":
+            content = json.dumps({"kind": "pose", "x": 0, "y": 0, "phi": 0, "id": f"g{number}"}).encode()
+        kind, key = ("goal", "goal/ann") if name == "goal" else ("cmd", f"cmd/ann/{'stop' if name == 'one' else name}")
+        answers: list[object] = []
+        incoming = came(kind, f"trirail/demo/{key}", content, number)
+        rig.gateway._handle(incoming._replace(at_door=answers.append, mark=mark if is_marked else None))
+        for ticket in list(rig.gateway._requests._pending):
+            rig.gateway._requests.answer(ticket, GoalReply("g", 1.0))
+        if name in ("stop", "pause") and is_marked:
+            stopped[mark.connection] = max(mark.called_ns, stopped.get(mark.connection, 0))
+        overtaken = is_marked and mark.called_ns < stopped.get(mark.connection, 0)
+        if name == "goal":
+            assert (rig.goals()[-1][1] is not None) == overtaken
+        elif name in ("enable", "resume"):
+            assert [getattr(answer, "code", None) for answer in answers] == [RefusalCode.STOPPED if overtaken else None]
 
 
 @pytest.mark.parametrize("under_way", [True, False])

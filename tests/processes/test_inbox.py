@@ -19,11 +19,12 @@ from trirail.processes.inbox import MAX_MESSAGES, MAX_MESSAGES_OF_USER, Inbox, _
 from trirail.processes.incoming import BURST, RATE, FairQueue, Incoming, Pace
 from trirail.processes.memory_budget import OVERHEAD
 from trirail.wire import zenoh_session
+from trirail.wire.call_mark import CallMark, new_connection
 from trirail.wire.messages import ErrorReply
 from trirail.wire.sizes import MAX_BESIDE, MAX_MESSAGE, MAX_TRANSPORT, MAX_UNREAD, MAX_UNREAD_OF_ONE
 from trirail.wire.stop_protocol import StopRequest
 from trirail.wire.vocabulary import Command
-from waiting import WITHIN
+from waiting import WITHIN, wait_until
 
 KEYS = {kind: len(route.names) for kind, route in ROUTES.items()}
 
@@ -212,6 +213,30 @@ def test_what_is_too_large_is_refused_when_it_comes_and_its_memory_is_not_held(t
         assert stop.query is None
         with pytest.raises(RefusedError, match="exceed the maximum"):  # so: without content
             stop.content(type(None), "")
+
+
+def test_calls_are_read_from_requests_and_from_both_copies_of_a_stop(tmp_path: Path) -> None:
+    locator, mark = f"unixsock-stream/{tmp_path}/z", CallMark(new_connection(), 12_345)
+    name = mark.new_id()
+    with zenoh_session.open_service([locator]) as opened, zenoh_session.open_client(locator) as client:
+        inbox = Inbox(opened, "demo", KEYS, lambda incoming, error: None)
+        inbox.declare()
+        for key, attached in (("goal/ann", str(mark)), ("cmd/ann/stop", name), ("cmd/ann/enable", "else")):
+            client.get(f"trirail/demo/{key}", zenoh.handlers.FifoChannel(1), attachment=attached)
+        inbox.stop_at_port(StopRequest("trirail/demo/cmd/ann/quick_stop", name), lambda answer: None)
+        marked: dict[str, tuple[str, CallMark | None]] = {}
+        wait_until(
+            lambda: (
+                marked.update((one.key.split("/", 2)[2], (one.id, one.mark)) for one in inbox.next_messages(9))
+                or len(marked) == 4
+            )
+        )
+    assert marked == {
+        "goal/ann": ("", mark),
+        "cmd/ann/stop": (name, mark),
+        "cmd/ann/enable": ("", None),
+        "cmd/ann/quick_stop": (name, mark),
+    }
 
 
 def test_what_is_too_large_is_not_kept_but_its_size_is(inbox: Inbox) -> None:

@@ -47,7 +47,6 @@ from trirail.wire.looks import AlignmentLook
 from trirail.wire.marks import MarkLike, StopAtLike, marks_of, stop_at_of
 from trirail.wire.messages import CommandReply, Event, GoalReply, RoleReply
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
-from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override, Role, SetOutput, Stop
 
@@ -384,8 +383,6 @@ class AsyncRobot:
                 self._stop_unanswered(goal_id)
             raise
         self._goals.accept(goal, reply)
-        if self._connection.later_stops(began) & STOPS:  # the stop may have overtaken the goal on its separate way
-            self._stop_unanswered(goal_id)
         return goal
 
     async def _is_present(self, goal_id: str) -> bool:
@@ -608,17 +605,14 @@ class AsyncRobot:
         within = {Command.HOME: HOME_WITHIN, Command.ENABLE: ENABLE_WITHIN}.get(command, REPLY_WITHIN)
         before = began if command.starts else math.inf
         reply = await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
-        for overtaking in self._connection.overtaking_stops(before, reply.seq) & STOPS:
-            with contextlib.suppress(ServiceError):  # the connection is closed
-                self._connection.query_unanswered(("cmd", self.user, overtaking), None)
         if command is Command.RESUME:
             self._connection.forget_pause(began)
         return reply
 
     async def _stop(self, command: Command, payload: bytes | None) -> CommandReply:
         """Send a command that stops the robot. Requests that were called for earlier are not sent afterwards."""
-        everything, called_for = stops_everything(command, payload), called_at()
-        if everything:
+        called_for = called_at()
+        if stops_everything(command, payload):
             self._connection.note_stop(command)
         if command is Command.PAUSE:
             try:
@@ -626,10 +620,7 @@ class AsyncRobot:
             except RefusedError:
                 self._connection.forget_pause(called_for)
                 raise
-        reply = await self._connection.stop(self.user, command, payload, REPLY_WITHIN)
-        if everything:
-            self._connection.confirm_stop(command, reply.seq)
-        return reply
+        return await self._connection.stop(self.user, command, payload, REPLY_WITHIN)
 
     async def info(self) -> Info:
         """Return the robot's geometry, limits, rates and versions."""

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 import zenoh
 
+from trirail.client.call_time import called_at
 from trirail.client.connection import CLOSED, HERE_WITHIN, REPLY_WITHIN, ROLE_WITHIN, Connection, SilenceError, once
 from trirail.client.stop_call import StopOrder
 from trirail.errors import RefusedError, ServiceError, TrirailError
@@ -79,10 +80,10 @@ class AsyncConnection:
         unreadable: ServiceError | None = None
         for part in before:
             self._connection.check_stops(began)
-            self.query_unanswered(parts, part)
+            self.query_unanswered(parts, part, began)
         self._connection.check_stops(began)
-        query = self._connection.query(parts, payload, within)
-        async with aclosing(self._replies(lambda session: session.get, attachment=copy, **query)) as replies:
+        query = self._connection.query(parts, payload, within, began) | ({"attachment": copy} if copy else {})
+        async with aclosing(self._replies(lambda session: session.get, **query)) as replies:
             async for reply in replies:
                 answer = self._connection.read(reply, kind)
                 if not isinstance(answer, ServiceError):
@@ -110,7 +111,8 @@ class AsyncConnection:
 
         Raises the same errors as `fetch`.
         """
-        stop = StopOrder.create(self._connection.robot, user, name, content, within)
+        mark = self._connection.mark(called_at())
+        stop = StopOrder.create(self._connection.robot, user, name, content, within, mark)
         with self._queue() as came, self._connection.copies(stop, self._in_loop(came.put_nowait)) as outcomes:
             try:
                 while (reply := outcomes.decide(await self._next(came))) is None:
@@ -119,25 +121,13 @@ class AsyncConnection:
                 raise await self.nobody("cmd", user, name) from error
         return reply
 
-    def note_stop(self, name: Command) -> float:
-        """Store the time of the present call, which stops the robot; return that time [s]."""
-        return self._connection.note_stop(name)
-
-    def confirm_stop(self, name: Command, cycle: int) -> None:
-        """Store the cycle in which a stop took effect."""
-        self._connection.confirm_stop(name, cycle)
+    def note_stop(self, name: Command) -> None:
+        """Store the time of the present call, which stops the robot."""
+        self._connection.note_stop(name)
 
     def forget_pause(self, until: float) -> None:
         """Forget a pause that was called at the time `until` [s] or earlier, because it was refused or taken back."""
         self._connection.forget_pause(until)
-
-    def overtaking_stops(self, began: float, cycle: int) -> set[Command]:
-        """Return the stops that were called later than `began` [s], but may have taken effect before a `cycle`."""
-        return self._connection.overtaking_stops(began, cycle)
-
-    def later_stops(self, began: float) -> set[Command]:
-        """Return the commands that stop the robot and were called later than `began` [s]."""
-        return self._connection.later_stops(began)
 
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
@@ -148,9 +138,9 @@ class AsyncConnection:
         """
         self._connection.post(parts, kind, payload, self._in_loop(deliver))
 
-    def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
-        """Send a query for the key that consists of `parts`, without waiting for a reply."""
-        self._connection.query_unanswered(parts, payload)
+    def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None, began: float = math.inf) -> None:
+        """Send a query for the key that consists of `parts`, without waiting for a reply; see Connection.query."""
+        self._connection.query_unanswered(parts, payload, began)
 
     async def nobody(self, *parts: str) -> ServiceError | RefusedError:
         """Return the error to raise if no reply arrived to a query for the key that consists of `parts`.

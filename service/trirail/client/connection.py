@@ -22,6 +22,7 @@ from trirail.client.stop_call import Outcome, Outcomes, StopOrder
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import least_role
+from trirail.wire.call_mark import CallMark, new_connection
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply, ErrorReply, Event, RoleReply
 from trirail.wire.starting import is_starting
@@ -83,8 +84,7 @@ class Connection:
         self._known = 0, 0.0
         self._stopped_at = {name: -math.inf for name in Command if name.stops}
         """Time of the newest call of each command that stops the robot, on the monotonic clock [s]."""
-        self._stop_cycles = dict.fromkeys(self._stopped_at, -math.inf)
-        """Cycle in which the newest call of each of these commands took effect; -inf if it is not confirmed."""
+        self._identity = new_connection()
         self._here = self._opened.liveliness().declare_token(self.key("here", user)) if user is not None else None
 
     @property
@@ -94,15 +94,22 @@ class Connection:
 
     # ------------------------------------------------------------------ asking
 
-    def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
-        """Send a query for the key that consists of `parts`, without waiting for a reply."""
+    def mark(self, at: float) -> CallMark:
+        """Return the mark of a request for which the program called at the time `at` on the monotonic clock [s]."""
+        return CallMark(self._identity, round(at * 1e9))
+
+    def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None, began: float = math.inf) -> None:
+        """Send a query for the key that consists of `parts`, without waiting for a reply; `began` as in `query`."""
         handler = zenoh.handlers.Callback(_ignore, indirect=False)
         with self.open_session() as session:
-            session.get(**self.query(parts, payload, REPLY_WITHIN), handler=handler)
+            session.get(**self.query(parts, payload, REPLY_WITHIN, began), handler=handler)
 
-    def query(self, parts: tuple[str, ...], payload: bytes | None, within: float) -> dict[str, Any]:
+    def query(
+        self, parts: tuple[str, ...], payload: bytes | None, within: float, began: float = math.inf
+    ) -> dict[str, Any]:
         """Return the arguments of zenoh.Session.get for a query for the key that consists of `parts`.
 
+        `began` is the time at which the program called for a request that may start motion [s]; inf for others.
         Zenoh sends a reply with the quality of service of its query, so the reply to a droppable query may be dropped.
         """
         boundary.check_size(len(payload or b""))
@@ -110,6 +117,7 @@ class Connection:
             "selector": self.key(*parts),
             "payload": payload,
             "encoding": boundary.JSON if payload else None,
+            "attachment": str(self.mark(began)) if began < math.inf else None,
             "timeout": within,
             "consolidation": zenoh.ConsolidationMode.NONE,  # deliver each reply without waiting for further replies
             "congestion_control": zenoh.CongestionControl.BLOCK,
@@ -160,32 +168,18 @@ class Connection:
             if at_door is not None:
                 at_door.cancel()
 
-    def note_stop(self, name: Command) -> float:
-        """Store the time of the present call, which stops the robot; return that time [s]."""
-        at = called_at()
-        self._stopped_at[name], self._stop_cycles[name] = max(self._stopped_at[name], at), -math.inf
-        return at
-
-    def confirm_stop(self, name: Command, cycle: int) -> None:
-        """Store the cycle in which a stop took effect."""
-        self._stop_cycles[name] = cycle
+    def note_stop(self, name: Command) -> None:
+        """Store the time of the present call, which stops the robot."""
+        self._stopped_at[name] = max(self._stopped_at[name], called_at())
 
     def forget_pause(self, until: float) -> None:
         """Forget a pause that was called at the time `until` [s] or earlier, because it was refused or taken back."""
         if self._stopped_at[Command.PAUSE] <= until:
             self._stopped_at[Command.PAUSE] = -math.inf
 
-    def overtaking_stops(self, began: float, cycle: int) -> set[Command]:
-        """Return the stops that were called later than `began` [s], but may have taken effect before a `cycle`."""
-        return {name for name in self.later_stops(began) if self._stop_cycles[name] < cycle}
-
-    def later_stops(self, began: float) -> set[Command]:
-        """Return the commands that stop the robot and were called later than `began` [s]."""
-        return {name for name, at in self._stopped_at.items() if began < at}
-
     def check_stops(self, began: float) -> None:
         """Raise RefusedError if a stop was called later than a request that has not been sent yet."""
-        if names := self.later_stops(began):
+        if names := {name for name, at in self._stopped_at.items() if began < at}:
             raise RefusedError(
                 RefusalCode.STOPPED, f"not sent: {' and '.join(sorted(names))} was called later and came first"
             )
@@ -205,7 +199,8 @@ class Connection:
 
         A thread of the connection calls `deliver` once; `deliver` must return quickly.
         """
-        query = self.query(parts, payload, POST_WITHIN) | {"congestion_control": zenoh.CongestionControl.DROP}
+        query = self.query(parts, payload, POST_WITHIN, called_at())
+        query["congestion_control"] = zenoh.CongestionControl.DROP
         self._post(query, kind, deliver)
 
     def _post(self, query: dict[str, Any], kind: type[T], deliver: Callable[[T | TrirailError], None]) -> None:

@@ -19,6 +19,7 @@ import msgspec
 
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import tls, zenoh_session
+from trirail.wire.call_mark import CallMark
 from trirail.wire.credentials import Credentials
 from trirail.wire.decoding import decoded
 from trirail.wire.messages import CommandReply, ErrorReply
@@ -49,9 +50,11 @@ class StopOrder(NamedTuple):
     """Id by which the service recognizes the two copies as the same stop."""
 
     @classmethod
-    def create(cls, robot: str, user: str, name: str, content: bytes | None, within: float) -> StopOrder:
-        """Return a stop with a new id."""
-        return cls(robot, user, name, content, within, uuid.uuid4().hex)
+    def create(
+        cls, robot: str, user: str, name: str, content: bytes | None, within: float, mark: CallMark | None = None
+    ) -> StopOrder:
+        """Return a stop with a new id, which shows the call of the stop if there is a `mark`."""
+        return cls(robot, user, name, content, within, uuid.uuid4().hex if mark is None else mark.new_id())
 
     @property
     def parts(self) -> tuple[str, str, str]:

@@ -18,6 +18,7 @@ from trirail.processes.incoming import FairQueue, Incoming, Pace
 from trirail.processes.memory_budget import OVERHEAD, Budget
 from trirail.processes.stop_port import Answer
 from trirail.wire import boundary, zenoh_session
+from trirail.wire.call_mark import mark_in
 from trirail.wire.messages import ErrorReply
 from trirail.wire.sizes import MAX_BESIDE, MAX_MESSAGE, MAX_NAME, MAX_UNREAD, MAX_UNREAD_OF_ONE
 from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest
@@ -157,7 +158,8 @@ class Inbox:
         """Enqueue a request from the stop port. This method may be called from any thread."""
         content = request.content.encode()
         stop = Incoming("cmd", request.key, len(content), content, "", None, time.monotonic_ns(), at_door=answer)
-        self._keep(_named(stop._replace(held=len(content) + OVERHEAD), request.id))
+        stop = stop._replace(held=len(content) + OVERHEAD, mark=mark_in(request.id))
+        self._keep(_named(stop, request.id))
 
     def _on_query(self, kind: str, query: zenoh.Query) -> None:
         encoding = str(query.encoding) if query.encoding is not None else ""
@@ -167,8 +169,10 @@ class Inbox:
         if incoming.size + beside > MAX_MESSAGE + MAX_BESIDE:
             self._keep_nothing(incoming._replace(size=incoming.size + beside, payload=b""))
             return
-        if _stops(incoming) and attachment is not None and len(attachment) <= MAX_NAME:
-            incoming = _named(incoming, attachment.to_bytes().decode(errors="replace"))
+        if attachment is not None and len(attachment) <= MAX_NAME:
+            text = attachment.to_bytes().decode(errors="replace")
+            incoming = incoming._replace(mark=mark_in(text))
+            incoming = _named(incoming, text) if _stops(incoming) else incoming
         self._keep(incoming)
 
     def _keep_nothing(self, large: Incoming) -> None:

@@ -19,6 +19,7 @@ from msgspec import structs
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.memory_budget import OVERHEAD, Reservation
 from trirail.wire import boundary
+from trirail.wire.call_mark import CallMark
 from trirail.wire.packets import GoalRequest
 from trirail.wire.sizes import MAX_UNREAD
 
@@ -54,6 +55,8 @@ class Incoming(NamedTuple):
     """Arrival time on the monotonic clock [ns]."""
     number: int = 0
     """Sequence number in the order of arrival."""
+    mark: CallMark | None = None
+    """Call for which the client has sent the message; None if the message is not marked."""
     id: str = ""
     """Id of a stop, which is the same in both copies of the stop; "" if the message has no id."""
     at_door: Callable[[Any], None] | None = None
@@ -208,6 +211,8 @@ class Backlog:
         self._goals: FairQueue[WaitingGoal] = FairQueue()
         self._bytes = 0
         self._stop = 0, ""
+        self._stop_calls: dict[str, tuple[int, str]] = {}
+        """Times of the newest calls of stops [ns], by connection, and their reasons."""
         self._stopped: dict[str, tuple[int, str]] = {}
         """Stops of single goals, by goal id. The values are the number of the stop's message, and the reason."""
 
@@ -232,11 +237,12 @@ class Backlog:
     def add(self, incoming: Incoming, request: GoalRequest) -> None:
         """Enqueue a goal after the user's other goals.
 
-        If the goal arrived before a stop that applies to it, it is enqueued as withdrawn.
+        If a stop that applies to the goal has overtaken it, it is enqueued as withdrawn.
         """
-        for before, reason in (self._stop, self._stopped.get(request.id, (0, ""))):
-            if incoming.number < before:
-                request = structs.replace(request, withdrawn=reason)
+        before, reason = self._stopped.get(request.id, (0, ""))
+        reason = reason if incoming.number < before else self._overtaking(incoming)
+        if reason:
+            request = structs.replace(request, withdrawn=reason)
         self._goals.put(request.user, WaitingGoal(incoming._replace(payload=b""), request))
         self._bytes += incoming.size
 
@@ -270,17 +276,31 @@ class Backlog:
         if len(self._stopped) > GOALS:
             del self._stopped[next(iter(self._stopped))]
 
-    def withdraw_all(self, reason: str, before: int) -> None:
-        """Withdraw every goal that arrived before the message numbered `before`, including goals not read yet."""
-        if before >= self._stop[0]:  # stops may be read in an order other than that of their arrival
-            self._stop = before, reason
-        self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.incoming.number < before else goal)
+    def withdraw_all(self, reason: str, stop: Incoming) -> None:
+        """Withdraw every goal that a stop has overtaken, including goals not read yet."""
+        if stop.number >= self._stop[0]:  # stops may be read in an order other than that of their arrival
+            self._stop = stop.number, reason
+        for mark in filter(None, (each.mark for each in (stop, *stop.alike))):
+            newest, _ = self._stop_calls.pop(mark.connection, (0, ""))
+            self._stop_calls[mark.connection] = max(newest, mark.called_ns), reason
+            if len(self._stop_calls) > GOALS:
+                del self._stop_calls[next(iter(self._stop_calls))]
+        self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.incoming.number < stop.number else goal)
 
-    def check_stops(self, number: int) -> None:
-        """Raise RefusedError if a stop of all goals has overtaken the message with this `number`."""
+    def check_stops(self, incoming: Incoming) -> None:
+        """Raise RefusedError if a stop of all goals has overtaken a message."""
+        if reason := self._overtaking(incoming):
+            raise RefusedError(RefusalCode.STOPPED, f"not carried out: {reason} was called later and came first")
+
+    def _overtaking(self, incoming: Incoming) -> str:
+        """Return the reason of a stop that has overtaken a message on its way or in the inbox; "" if none has."""
         before, reason = self._stop
-        if number < before:
-            raise RefusedError(RefusalCode.STOPPED, f"not carried out: {reason} arrived later and came first")
+        if incoming.number < before:
+            return reason
+        if incoming.mark is None:
+            return ""
+        called_ns, reason = self._stop_calls.get(incoming.mark.connection, (0, ""))
+        return reason if incoming.mark.called_ns < called_ns else ""
 
     def withdraw_others(self, user: str | None, reason: str) -> None:
         """Withdraw the goals of all users except `user`."""

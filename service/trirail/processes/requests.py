@@ -296,7 +296,7 @@ class CommandReader:
             self._replies.answer(incoming, self._stopped())
             return
         if name.starts:
-            backlog.check_stops(incoming.number)
+            backlog.check_stops(incoming)
         renews = name.ignores_lease and self._states.lease == user
         if not (name.stops or renews):
             incoming.check_age()
@@ -305,7 +305,7 @@ class CommandReader:
             self._of_unread.add(ticket)
             backlog.withdraw_coming(goal, reason, incoming.number)
         if name.stops and goal is None and (name.ignores_lease or self._states.lease in (None, user)):
-            backlog.withdraw_all(reason, incoming.number)
+            backlog.withdraw_all(reason, incoming)
 
 
 class Looks:
