@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable
 
 import msgspec
 import numpy as np
 import pytest
 from conftest import Rig, changed
-from control_rig import CONFIG, expected_duration
+from control_rig import CONFIG, ControlRig, expected_duration
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from trirail.config import Config, geometry
 from trirail.control.in_position import Settling, monitor
 from trirail.control.modes import ModeEvent
@@ -301,6 +303,26 @@ def test_a_trajectory_may_ask_not_to_settle(behind: Rig) -> None:
     behind.until(behind.holds)
     assert ends(behind)[1].settle is not None
     assert away(behind) <= 1.0
+
+
+@pytest.mark.generated(*range(10))
+def test_the_robot_rests_after_a_trajectory_that_does_not_settle(seed: int) -> None:
+    """Also if a setpoint is exactly at the end of the path, where the path may still have an acceleration."""
+    chance = random.Random(seed)
+    rate_hz = chance.choice((256, 512, 1000, 1024))
+    rig = ControlRig(replace(CONFIG, loop=replace(CONFIG.loop, rate_hz=rate_hz)))
+    rig.enable()
+    for number in range(6):
+        x, y, phi = rig.control.commanded.pose
+        end = chance.choice((chance.randrange(2, 9), chance.randrange(256, 600))) / rate_hz
+        acceleration = chance.choice((None, (-0.02, 0.0, 0.0)))
+        last = TrajectoryPoint(end, x + min(0.003, 0.01 * end**3), y, phi, acceleration=acceleration)
+        trajectory = TrajectoryGoal((TrajectoryPoint(0.0, x, y, phi), last), settle=False, stretch=True)
+        assert isinstance(rig.send(f"t{number}", trajectory), Accepted)
+        rig.until(rig.holds)
+        assert rig.control.commanded.at_rest
+        assert isinstance(rig.send(f"g{number}", PoseGoal(chance.uniform(-0.01, 0.01), y, phi)), Accepted)
+        rig.until(rig.holds)
 
 
 def test_a_jog_does_not_settle(behind: Rig) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from trirail.motion.marks import GoalMarks
 from trirail.motion.paths import Path
-from trirail.motion.runs import MotionState, OwnBounds, Run
+from trirail.motion.runs import MotionState, OwnBounds, Run, rest
 
 
 class Schedule:
@@ -84,8 +84,10 @@ class Schedule:
         return at.s == at.rate == at.change == 0.0
 
     def replace_runs(self, runs: deque[Run]) -> None:
-        """Replace all runs. The first new run must begin in the commanded state."""
+        """Replace all runs. The first new run must begin in the commanded state; without runs, the platform rests."""
         self.runs = runs
+        if not runs:  # the last setpoint of a path may have the velocity and the acceleration of its end
+            self.commanded = rest(self.commanded.pose)
         self.version += 1
 
     def append(self, s: float, path: Path, marks: GoalMarks | None = None, own: OwnBounds | None = None) -> None:
