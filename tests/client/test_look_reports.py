@@ -32,6 +32,8 @@ class Told:
         self.stage = Stage({name: camera(rng, place) for name, place in PART.items()}, PART, rng, 0.05)
         self.looks: list[AlignmentLook] = []
         self.trouble: ServiceError | None = None
+        self.begun: list[float] = []
+        """Times at which procedures were announced [s]."""
         self.takes = 1.0
         """Duration of each motion [s]."""
 
@@ -51,13 +53,22 @@ class Told:
     def stop(self) -> None:
         pass
 
+    def _begin_call(self, began: float) -> None:
+        self.begun.append(began)
+
     def _report_look(self, message: bytes) -> None:
         if self.trouble is not None:
             raise self.trouble
         self.looks.append(boundary.decode(message, AlignmentLook, "no look"))
 
     def drive(self, wishes: Any, look: Callable[[], Any] | None = None) -> Any:
-        return drive(self, look or self.stage.look, wishes, 1.0, 0.0)
+        number, looks = len(self.begun), look or self.stage.look
+
+        def check_begun() -> Any:  # a stop while the first picture is taken already ends the procedure
+            assert len(self.begun) == number + 1
+            return looks()
+
+        return drive(self, check_begun, wishes, 1.0, 0.0)
 
 
 def test_a_slow_motion_has_its_time() -> None:
@@ -191,6 +202,9 @@ def test_an_event_loop_tells_the_same() -> None:
 
         async def _report_look(self, message: bytes) -> None:
             told._report_look(message)
+
+        async def _begin_call(self, began: float) -> None:
+            told._begin_call(began)
 
     async def look() -> Any:
         return told.stage.look()

@@ -293,6 +293,35 @@ def test_what_was_called_for_before_a_stop_of_its_connection_is_not_carried_out_
             assert [getattr(answer, "code", None) for answer in answers] == [RefusalCode.STOPPED if overtaken else None]
 
 
+@pytest.mark.parametrize(
+    ("stop", "user", "content", "ends"),
+    [
+        ("stop", "eva", b"", True),
+        ("quick_stop", "ann", b"", True),
+        ("disable", "eva", b"", True),
+        ("pause", "ann", b"", False),
+        ("stop", "eva", b'{"goal": "other"}', False),
+    ],
+)
+@pytest.mark.parametrize("late", [False, True])
+def test_a_call_that_sends_goals_later_ends_with_a_stop_of_any_user(
+    rig: Rig, stop: str, user: str, content: bytes, ends: bool, late: bool
+) -> None:
+    """As an alignment does, whose robot may rest when the stop comes. `late`: the gateway reads the stop last."""
+    mark, other = CallMark(new_connection(), 5), CallMark(new_connection(), 3)
+    rig.gateway._handle(came("role", "trirail/demo/role/ann", b"", 1)._replace(mark=mark))
+    if not late:
+        rig.command(stop, content, user, number=3)
+    rig.gateway._handle(came("role", "trirail/demo/role/ann", b"", 4)._replace(mark=mark))
+    if late:
+        rig.command(stop, content, user, number=3)
+    begun = came("goal", "trirail/demo/goal/ann", b'{"kind": "pose", "x": 0, "y": 0, "phi": 0}', 5)
+    for each in (mark, other, mark._replace(called_ns=6)):
+        rig.gateway._handle(begun._replace(mark=each))
+    reason = f"{stop} by {user}" if ends else None
+    assert [withdrawn for _, withdrawn in rig.goals()] == [reason, None, None]
+
+
 @pytest.mark.parametrize("under_way", [True, False])
 def test_a_stop_of_a_goal_that_waits_reaches_the_loop_which_may_have_another_of_its_id(
     rig: Rig, under_way: bool

@@ -72,6 +72,8 @@ class StageRobot(Protocol):
 
     def _report_look(self, look: bytes, /) -> Awaitable[None] | None: ...
 
+    def _begin_call(self, began: float, /) -> Awaitable[None] | None: ...
+
 
 def drive(
     robot: StageRobot, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
@@ -135,6 +137,7 @@ async def drive_async(
     reports = LookReports()
     ids = reports.goal_ids()
     try:
+        await completed(robot._begin_call(began))
         request = next(requests)
         while True:
             if isinstance(request, LookReport):

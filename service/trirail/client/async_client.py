@@ -514,6 +514,10 @@ class AsyncRobot:
 
         return await drive_async(self, look, requests, speed, wait)
 
+    async def _begin_call(self, began: float) -> None:
+        """Announce a call of the time `began` [s] that sends goals later: after a stop, they are refused."""
+        await self._connection.fetch(("role", self.user), RoleReply, began=began)
+
     async def _report_look(self, look: bytes) -> None:
         """Report a look of an alignment to the service; `look` is the JSON of a trirail.wire.looks.AlignmentLook."""
         await self._connection.fetch(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)

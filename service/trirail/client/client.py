@@ -330,3 +330,4 @@ class Robot:
         return drive(self, look, requests, speed, wait)
 
     _report_look = _call(AsyncRobot._report_look)
+    _begin_call = _call(AsyncRobot._begin_call)

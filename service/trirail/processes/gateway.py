@@ -202,6 +202,7 @@ class Gateway:
 
         An error is sent in the reply and is also announced to all clients, because a put has no reply.
         """
+        self._requests.backlog.note_call(incoming)
         try:
             route = ROUTES[incoming.kind]
             if (reply := route.handle(self, route.read(incoming, self._robot))) is not None:

@@ -211,8 +211,12 @@ class Backlog:
         self._goals: FairQueue[WaitingGoal] = FairQueue()
         self._bytes = 0
         self._stop = 0, ""
+        self._call_stop = 0, ""
+        """Newest stop that also ends calls which have sent nothing but their first messages, as a pause does not."""
         self._stop_calls: dict[str, tuple[int, str]] = {}
         """Times of the newest calls of stops [ns], by connection, and their reasons."""
+        self._calls: dict[CallMark, int] = {}
+        """Number of the first message of each call. A call may send more messages later, such as an alignment."""
         self._stopped: dict[str, tuple[int, str]] = {}
         """Stops of single goals, by goal id. The values are the number of the stop's message, and the reason."""
 
@@ -276,10 +280,15 @@ class Backlog:
         if len(self._stopped) > GOALS:
             del self._stopped[next(iter(self._stopped))]
 
-    def withdraw_all(self, reason: str, stop: Incoming) -> None:
-        """Withdraw every goal that a stop has overtaken, including goals not read yet."""
-        if stop.number >= self._stop[0]:  # stops may be read in an order other than that of their arrival
-            self._stop = stop.number, reason
+    def withdraw_all(self, reason: str, stop: Incoming, *, ends_calls: bool) -> None:
+        """Withdraw every goal that a stop has overtaken, including goals not read yet.
+
+        With `ends_calls`, the goals are also withdrawn that calls of before the stop send later.
+        """
+        # Stops may be read in an order other than that of their arrival.
+        self._stop = max(self._stop, (stop.number, reason))
+        if ends_calls:
+            self._call_stop = max(self._call_stop, (stop.number, reason))
         for mark in filter(None, (each.mark for each in (stop, *stop.alike))):
             newest, _ = self._stop_calls.pop(mark.connection, (0, ""))
             self._stop_calls[mark.connection] = max(newest, mark.called_ns), reason
@@ -292,13 +301,27 @@ class Backlog:
         if reason := self._overtaking(incoming):
             raise RefusedError(RefusalCode.STOPPED, f"not carried out: {reason} was called later and came first")
 
+    def note_call(self, incoming: Incoming) -> None:
+        """Store the number of the first message of a call."""
+        if incoming.mark is not None:
+            first = self._calls.pop(incoming.mark, incoming.number)
+            self._calls[incoming.mark] = min(first, incoming.number)
+            if len(self._calls) > GOALS:
+                del self._calls[next(iter(self._calls))]
+
     def _overtaking(self, incoming: Incoming) -> str:
-        """Return the reason of a stop that has overtaken a message on its way or in the inbox; "" if none has."""
+        """Return the reason of a stop that has overtaken a message, or that came after the call of the message.
+
+        Return "" if there is no such stop.
+        """
         before, reason = self._stop
         if incoming.number < before:
             return reason
         if incoming.mark is None:
             return ""
+        before, reason = self._call_stop
+        if self._calls.get(incoming.mark, before) < before:
+            return reason
         called_ns, reason = self._stop_calls.get(incoming.mark.connection, (0, ""))
         return reason if incoming.mark.called_ns < called_ns else ""
 

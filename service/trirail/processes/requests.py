@@ -305,7 +305,7 @@ class CommandReader:
             self._of_unread.add(ticket)
             backlog.withdraw_coming(goal, reason, incoming.number)
         if name.stops and goal is None and (name.ignores_lease or self._states.lease in (None, user)):
-            backlog.withdraw_all(reason, incoming)
+            backlog.withdraw_all(reason, incoming, ends_calls=name in STOPS)
 
 
 class Looks:
