@@ -19,7 +19,7 @@ import zenoh
 from control_rig import CONFIG, carried
 from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
-from trirail.processes.incoming import GOAL_PATIENCE, GOALS_OF_ONE, MAX_COMMAND_WAIT, Incoming
+from trirail.processes.incoming import GOAL_PATIENCE, GOALS, GOALS_OF_ONE, MAX_COMMAND_WAIT, Incoming
 from trirail.processes.replies import REFUSALS_OF_USER
 from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER, REPLY_TIMEOUT_S
 from trirail.processes.session_guard import Guard
@@ -107,6 +107,7 @@ class Rig:
         return [request.notice for request in self.sent if isinstance(request, Announcement)]
 
 
+POSE = b'{"kind": "pose", "x": 0, "y": 0, "phi": 0}'
 EVERYBODYS_STOPS = (Command.STOP, Command.QUICK_STOP, Command.DISABLE)
 
 
@@ -315,11 +316,28 @@ def test_a_call_that_sends_goals_later_ends_with_a_stop_of_any_user(
     rig.gateway._handle(came("role", "trirail/demo/role/ann", b"", 4)._replace(mark=mark))
     if late:
         rig.command(stop, content, user, number=3)
-    begun = came("goal", "trirail/demo/goal/ann", b'{"kind": "pose", "x": 0, "y": 0, "phi": 0}', 5)
+    begun = came("goal", "trirail/demo/goal/ann", POSE, 5)
     for each in (mark, other, mark._replace(called_ns=6)):
         rig.gateway._handle(begun._replace(mark=each))
     reason = f"{stop} by {user}" if ends else None
     assert [withdrawn for _, withdrawn in rig.goals()] == [reason, None, None]
+
+
+def test_what_was_called_at_the_time_of_a_stop_is_carried_out(rig: Rig) -> None:
+    """A call may stop the robot first, and then move it."""
+    mark = CallMark(new_connection(), 5)
+    rig.gateway._handle(came("cmd", "trirail/demo/cmd/ann/stop", b"", 1)._replace(mark=mark))
+    rig.gateway._handle(came("goal", "trirail/demo/goal/ann", POSE, 2)._replace(mark=mark))
+    assert [withdrawn for _, withdrawn in rig.goals()] == [None]
+
+
+def test_calls_are_remembered_up_to_a_limit(rig: Rig) -> None:
+    backlog = rig.gateway._requests.backlog
+    for number in range(GOALS + 5):
+        stop = came("cmd", "trirail/demo/cmd/ann/stop", b"", number)._replace(mark=CallMark(f"{number:012x}", number))
+        backlog.note_call(stop)
+        backlog.withdraw_all("stop by ann", stop, ends_calls=True)
+    assert len(backlog._calls) == len(backlog._stop_calls) == GOALS
 
 
 @pytest.mark.parametrize("under_way", [True, False])
