@@ -660,6 +660,33 @@ def test_a_planner_that_is_not_there_costs_the_goal_and_the_next_one_is_taken(sh
     assert shell.mode() is Mode.MOVING
 
 
+@pytest.mark.parametrize("full", [False, True])
+def test_a_request_that_does_not_reach_the_planner_is_refused_with_the_reason(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, full: bool
+) -> None:
+    """A planner that dies between the reading of its answers and the request is known to be dead by the request."""
+    shell.enabled()
+    shell.serves = False
+    shell.received()
+    read = shell.loop._planner.read
+
+    def read_before_the_end(*given: Any) -> None:
+        read(*given)
+        shell.planner.close()
+
+    if full:
+        while shell.ports.planner.send(bytes(10_000)):
+            pass
+    else:
+        monkeypatch.setattr(shell.loop._planner, "read", read_before_the_end)
+    shell.send(2, "g-1", PoseGoal(0.05, 0.0, 0.0))
+    shell.cycles(2)
+    (text,) = (answer.message for answer in shell.said() if isinstance(answer, Refused))
+    assert text.startswith(
+        "the queue of requests to the planner is full" if full else "the planner is not running and is being restarted"
+    )
+
+
 @pytest.mark.parametrize(
     "junk",
     [

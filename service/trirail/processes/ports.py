@@ -112,12 +112,12 @@ class PlannerLink:
 
     def request_plan(self, request: PlanRequest) -> None:
         """Send a request to the planner. If that fails, `read` reports the failure in the next cycle."""
-        if not self._port.connected:
-            self._unsent = "the planner is not running and is being restarted"
-        elif not self._port.send(encode(request)):
-            self._unsent = "the queue of requests to the planner is full"
-        else:
+        if self._port.send(encode(request)):
             self._awaited = request.number
+        elif self._port.connected:
+            self._unsent = "the queue of requests to the planner is full"
+        else:  # perhaps since this attempt, which was the first to notice that the planner has died
+            self._unsent = "the planner is not running and is being restarted"
 
     def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
         """Yield the answers and reports that have been read but not handled."""
