@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import gc
+import weakref
 from collections import deque
 from collections.abc import Collection
 
@@ -107,3 +110,39 @@ def test_a_refused_frame_is_refused_again_and_not_tried_twice(refused: int, erro
         else:
             frames.send(frame)
     assert bus.sent == [row.tobytes()[: CAN_FRAME.size] for number, row in enumerate(sent.frames) if number != refused]
+
+
+class Down(Fake):
+    """A bus on which everything fails."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.raised: list[weakref.ref[BaseException]] = []
+
+    def error_now(self) -> BaseException:
+        error = can.CanOperationError("down")
+        self.raised.append(weakref.ref(error))
+        return error
+
+    def send(self, frame: Frame) -> None:
+        raise self.error_now()
+
+    def receive(self, timeout: float = 0.0) -> Received | None:
+        raise self.error_now()
+
+
+def test_no_error_is_kept_after_it_was_raised() -> None:
+    """The loop runs without a garbage collector, and a bus that is down may fail in each cycle."""
+    bus, frame = Down(), Frame(0x200, b"")
+    frames, room = FrameCalls(bus), PackedFrames(ROOM)
+    gc.disable()
+    try:
+        called(frames.access.receive, room, ROOM)
+        with contextlib.suppress(can.CanOperationError):
+            frames.receive()
+        called(frames.access.send, packed_frames([frame]), 1)
+        with contextlib.suppress(can.CanOperationError):
+            frames.send(frame)
+        assert [error() for error in bus.raised] == [None, None]
+    finally:
+        gc.enable()

@@ -60,7 +60,10 @@ class FrameCalls:
         """Send a frame without waiting, or raise."""
         if self._refusal is not None:
             error, self._refusal = self._refusal, None
-            raise error
+            try:
+                raise error
+            finally:
+                del error  # its traceback keeps this frame, and the loop has no garbage collector to end such a cycle
         self._frames.send(frame)
 
     def receive(self, timeout: float = 0.0) -> Received | None:
@@ -69,7 +72,10 @@ class FrameCalls:
             return self._put_back.popleft()
         if self._failure is not None:
             error, self._failure = self._failure, None
-            raise error
+            try:
+                raise error
+            finally:
+                del error  # as in `send`
         return self._frames.receive(timeout)
 
     def set_identifiers(self, identifiers: Collection[int]) -> None:
