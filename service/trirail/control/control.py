@@ -479,8 +479,8 @@ class Control:
             if released is not None:
                 words = f"goal {released.id} of {released.user} was not renewed in time"
                 reason = coded(words, EventCode.NOT_RENEWED, goal=released.id, user=released.user)
-                if released.refusal is not None:
-                    words = f"a renewal of goal {released.id} of {released.user} was refused: {released.refusal}"
+                if (refused := released.refusal) is not None:
+                    words = f"a renewal of goal {released.id} of {released.user} was refused: {refused.message}"
                     reason = coded(words, EventCode.REFUSED)
                 self.modes.apply_event(ModeEvent.NOT_RENEWED, reason)
             beginning = self.goal_queue.step(self.modes.cycle, self._admit, self._place)

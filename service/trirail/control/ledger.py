@@ -51,8 +51,8 @@ class ActiveGoal(NamedTuple):
     """Last cycle of the goal if the goal is not renewed."""
     released: bool = False
     """Whether the goal was not renewed in time. A late renewal cannot revive the goal."""
-    refusal: RefusedError | None = None
-    """Refusal of a renewal, which has ended the goal; None if there is none."""
+    refusal: Refused | None = None
+    """Answer that refused a renewal, which has ended the goal; None if there is none."""
     bound: str | None = None
     """Name of the limit that stops a jog, or that the target of a track exceeds."""
     settles: bool = True
@@ -70,7 +70,9 @@ class ActiveGoal(NamedTuple):
 class _GoalEnd(NamedTuple):
     """Summary of a goal that has ended.
 
-    `bound` is the limit at which a jog has ended, `refusal` the refusal of the goal or of its renewal.
+    `bound` is the limit at which a jog has ended, `refusal` the text that refused the renewal of a goal that is done;
+    empty if no renewal was refused. A summary is kept for long. It contains no exception, because the traceback of an
+    exception keeps the local variables of all its calls, such as the goal with its trajectory.
     """
 
     user: str
@@ -78,7 +80,7 @@ class _GoalEnd(NamedTuple):
     outcome: Outcome
     reason: str
     bound: str | None
-    refusal: RefusedError | None
+    refusal: str
 
     def renewal_error(self, goal_id: str) -> RefusedError:
         """Return the error for a renewal that arrives after the end of this goal."""
@@ -127,7 +129,7 @@ class Ledger:
                 RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has already been used: give every goal its own id"
             )
         if self.goal is not None and self.goal.released and self.renewed_by(request):
-            raise _not_renewed(goal_id, self.goal.refusal)
+            raise _not_renewed(goal_id, self.goal.refusal.message if self.goal.refusal is not None else "")
 
     def pass_over(self, request: GoalRequest) -> None:
         """Answer a renewal as accepted although a newer renewal has replaced it."""
@@ -231,7 +233,7 @@ class Ledger:
             if bound is not None:
                 text = coded(f"at the limit of {bound}", EventCode.STOPPED_AT_LIMIT)
             elif refusal is not None:
-                text = coded(f"a renewal was refused: {refusal}", EventCode.REFUSED)
+                text = coded(f"a renewal was refused: {refusal.message}", EventCode.REFUSED)
             self._end_goal(goal.id, goal.user, goal.kind, outcome, text, bound, settled, refusal)
         self.goals.extend(kept)
 
@@ -242,13 +244,12 @@ class Ledger:
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
         """End a goal that has not begun, and answer the request with a refusal."""
-        self.answers.append(
-            Refused(request.ticket, RefusalCode(outcome), f"goal {request.id} {outcome} before it began: {reason}")
-        )
+        text = f"goal {request.id} {outcome} before it began: {reason}"
+        refused = Refused(request.ticket, RefusalCode(outcome), text)
+        self.answers.append(refused)
         if all(goal.id != request.id for goal in self.goals):  # otherwise the id is that of an active goal
-            refusal = RefusedError(RefusalCode(outcome), reason)
             ended = coded(reason, EventCode.REFUSED)
-            self._end_goal(request.id, request.user, type(request.goal), outcome, ended, refusal=refusal)
+            self._end_goal(request.id, request.user, type(request.goal), outcome, ended, refused=refused)
 
     def is_all_of(self, user: str | None) -> bool:
         """Return whether all active goals, and all active commands that need the lease, belong to the given user."""
@@ -266,27 +267,26 @@ class Ledger:
         if isinstance(request, GoalRequest) and request.goal.frequent and not self.renewed_by(request):
             ended = refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER)
             answered = text if ended else f"{text}; goal {request.id!r} has ended: start a new goal"
-        self.answers.append(
-            Refused(request.ticket, refusal.code, answered, refusal.slider, refusal.value, refusal.limit)
-        )
+        refused = Refused(request.ticket, refusal.code, answered, refusal.slider, refusal.value, refusal.limit)
+        self.answers.append(refused)
         if isinstance(request, CommandRequest):
-            self.notices.append(_refused(f"{request.name} refused: {text}", request.user, refusal))
+            self.notices.append(_refused(f"{request.name} refused: {text}", request.user, refused))
             return
         if request.goal.frequent:
             before, self._refused = self._refused, (request.id, refusal.code)
             if before == self._refused:
                 return
         if refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER):
-            self.notices.append(_refused(text, request.user, refusal))
+            self.notices.append(_refused(text, request.user, refused))
         else:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
-                self.notices.append(_refused(text, request.user, refusal))
+                self.notices.append(_refused(text, request.user, refused))
                 if not request.goal.frequent:  # a refused renewal also ends the goal
-                    self.goals[0] = self.goals[0]._replace(alive_until=-math.inf, refusal=refusal)
+                    self.goals[0] = self.goals[0]._replace(alive_until=-math.inf, refusal=refused)
             else:
                 reason = coded(text, EventCode.REFUSED)
-                self._end_goal(request.id, request.user, type(request.goal), outcome, reason, refusal=refusal)
+                self._end_goal(request.id, request.user, type(request.goal), outcome, reason, refused=refused)
 
     def renewed_by(self, request: GoalRequest) -> bool:
         """Return whether a request renews the current goal. Both must have the same id, user and kind."""
@@ -307,12 +307,13 @@ class Ledger:
         reason: EventText,
         bound: str | None = None,
         settled: SettlingResult | None = None,
-        refusal: RefusedError | None = None,
+        refused: Refused | None = None,
     ) -> None:
         if goal_id in self._ended:  # the event that ended the goal has also withdrawn a waiting renewal
             return
         self._on_end(goal_id, outcome)
         level = _LEVELS.get(outcome, "info")
+        refusal = refused.message if refused is not None and outcome == "done" else ""
         self._ended[goal_id] = _GoalEnd(user, kind, outcome, reason.text, bound, refusal)
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
@@ -320,7 +321,7 @@ class Ledger:
         notice = Notice(
             "goal", level, words, id=goal_id, outcome=outcome, reason=reason.text, user=user, **reason.fields
         )
-        notice = _with_code(notice, refusal) if refusal is not None else notice
+        notice = _with_code(notice, refused) if refused is not None else notice
         self.notices.append(structs.replace(notice, **settled._asdict()) if settled is not None else notice)
 
     # ------------------------------------------------------------------ commands
@@ -359,19 +360,19 @@ class Ledger:
                     self.answers.append(CommandDone(request.ticket, name, mode, cycle))
 
 
-def _refused(text: str, user: str, refusal: RefusedError) -> Notice:
-    return _with_code(Notice("refused", "warning", text, user=user, event_code=EventCode.REFUSED), refusal)
+def _refused(text: str, user: str, refused: Refused) -> Notice:
+    return _with_code(Notice("refused", "warning", text, user=user, event_code=EventCode.REFUSED), refused)
 
 
-def _with_code(notice: Notice, refusal: RefusedError) -> Notice:
+def _with_code(notice: Notice, refused: Refused) -> Notice:
     """Return the notice with the fields of the refusal added."""
-    about = {name: getattr(refusal, name) for name in ("code", "slider", "value", "limit")}
+    about = {name: getattr(refused, name) for name in ("code", "slider", "value", "limit")}
     return structs.replace(notice, **about)
 
 
-def _not_renewed(goal_id: str, refusal: RefusedError | None) -> RefusedError:
+def _not_renewed(goal_id: str, refusal: str) -> RefusedError:
     """Return the error for a renewal of a goal that was not renewed in time, or that a refused renewal has ended."""
-    if refusal is not None:
+    if refusal:
         text = f"goal {goal_id!r} has ended because a renewal was refused ({refusal}); start a new goal"
         return RefusedError(RefusalCode.JOG_OVER, text)
     return RefusedError(
