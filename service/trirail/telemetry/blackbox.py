@@ -3,6 +3,9 @@
 The file is `fault-<time>.rrd` in the folder of the recording. It has the same content as a recording: every record, the
 control inputs, the log, the drawing, the configuration and the software versions. It also contains the seconds after
 the fault, in which the robot stops.
+
+If faults repeat, they share files: after a file, the next one is written a minute later, and begins where it ended. The
+files of all faults together contain the minute before each of them.
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ AFTER_S = 2.0
 """Time kept after the fault [s]."""
 MARGIN_S = 1.0
 """Extra time kept, because the start or the end of the saved time may fall within a batch [s]."""
+KEPT_S = BEFORE_S + 2.0 * AFTER_S + MARGIN_S
+"""Time for which data is kept [s]. A second fault within AFTER_S of the first one delays the file by up to AFTER_S."""
 
 MAX_MESSAGES_MB = 12.0
 """Maximum memory for stored messages, including MESSAGE_OVERHEAD for each [1e6 bytes].
@@ -82,19 +87,28 @@ class BlackBox:
         self._latched: dict[str, Fill] = {}
         self._t = 0.0
         self._faults: deque[Event] = deque()
-        self._writing: list[threading.Thread] = []
+        """Faults that are not saved yet, or without all of the time after them."""
+        self._saved_at = -math.inf
+        """Time at which the data for the last file was taken from the memory [s]."""
+        self._writing: threading.Thread | None = None
+        self._reported: set[EventCode] = set()
+        """Delay or loss of faults that was reported since the last file."""
 
     def records(self, batch: bytes) -> None:
-        """Store packed records; after a fault, write the file as soon as AFTER_S seconds of records have arrived."""
+        """Store packed records. Write a file if it is due, unless the last one is still being written."""
         self._t = last_cycle(batch) / self._rate_hz
         self._records.append(StoredInput(next(self._order), self._t, methodcaller("records", batch)))
-        oldest = self._t - BEFORE_S - AFTER_S - MARGIN_S
+        oldest = self._t - KEPT_S
         while self._records[0].t < oldest:
             self._records.popleft()
         while self._messages and self._messages[0].t < oldest:
             self._forget()
-        while self._faults and self._t >= self._faults[0].t + AFTER_S:
-            self._write(self._faults.popleft())
+        if self._faults and self._faults[0].t < oldest:
+            self._report_loss(oldest)
+        if self._faults and self._t < self._due:
+            self._report_delay()
+        elif self._faults and not self._is_writing:
+            self._write()
 
     def event(self, event: Event) -> None:
         """Store an event; if it is a fault, schedule the writing of a file."""
@@ -111,11 +125,49 @@ class BlackBox:
         self._keep(methodcaller(name, *values), lasting=name)
 
     def close(self) -> None:
-        """Write the files that are still due, and wait until all files are complete."""
-        while self._faults:
-            self._write(self._faults.popleft())
-        for thread in self._writing:
-            thread.join()
+        """Wait until the last file is complete; if faults are not saved yet, write another one for all of them."""
+        self._wait()
+        if self._faults:
+            self._write()
+            self._wait()
+
+    def _wait(self) -> None:
+        if self._writing is not None:
+            self._writing.join()
+
+    @property
+    def _is_writing(self) -> bool:
+        return self._writing is not None and self._writing.is_alive()
+
+    @property
+    def _due(self) -> float:
+        """Time at which the waiting faults are saved [s].
+
+        This is AFTER_S after them; those that follow the first one by more than AFTER_S do not delay it further. A file
+        is due at least BEFORE_S after the last one, so that files do not repeat each other's data.
+        """
+        first, newest = self._faults[0].t, self._faults[-1].t
+        return max(min(first + AFTER_S, newest) + AFTER_S, self._saved_at + BEFORE_S)
+
+    def _report_delay(self) -> None:
+        """Report that a fault is saved later than usual, once per file."""
+        due = self._due
+        if due > self._faults[0].t + 2.0 * AFTER_S and EventCode.BLACK_BOX_LATER not in self._reported:
+            self._reported.add(EventCode.BLACK_BOX_LATER)
+            words = f"black box: faults repeat within a minute; those until t = {due:.1f} s are saved in one file"
+            self._warn(coded(words, EventCode.BLACK_BOX_LATER, until=due))
+
+    def _report_loss(self, oldest: float) -> None:
+        """Drop the faults before `oldest`, whose data is no longer in the memory; report that once per file."""
+        while self._faults and self._faults[0].t < oldest:
+            self._faults.popleft()
+        if EventCode.NO_BLACK_BOX not in self._reported:
+            self._reported.add(EventCode.NO_BLACK_BOX)
+            self._warn_unsaved("the disk is so slow that the previous black box is still being written")
+
+    def _warn_unsaved(self, error: str) -> None:
+        words = f"black box: the minute before the fault is not saved: {error}"
+        self._warn(coded(words, EventCode.NO_BLACK_BOX, error=error))
 
     def _keep_packed(self, message: EventReport | ControlInput) -> None:
         """Store a message in packed form, which is many times smaller than the decoded message."""
@@ -136,8 +188,14 @@ class BlackBox:
         if old.lasting:
             self._latched[old.lasting] = old.fill
 
-    def _write(self, fault: Event) -> None:
-        if self._dropped_at >= self._t - BEFORE_S - AFTER_S - MARGIN_S:
+    def _write(self) -> None:
+        """Begin to write a file, which contains all waiting faults."""
+        fault = self._faults[0]
+        self._saved_at = self._t
+        self._reported.clear()
+        while self._faults and self._faults[0].t + AFTER_S <= self._t:  # the time after the others is in the next file
+            self._faults.popleft()
+        if self._dropped_at >= self._t - KEPT_S:
             # A flood of messages has filled the memory in less than a minute.
             words = (
                 f"black box: messages exceed {MAX_MESSAGES_MB:g} MB; "
@@ -146,16 +204,14 @@ class BlackBox:
             self._warn(coded(words, EventCode.BLACK_BOX_SHORT, until=self._dropped_at))
         fills = [*self._latched.values(), *(kept.fill for kept in heapq.merge(self._records, self._messages))]
         # Writing takes a second or two. It runs in a thread, because the recording must continue meanwhile.
-        thread = threading.Thread(target=self._fill, args=(fault, fills), name="black box")
-        self._writing = [writing for writing in self._writing if writing.is_alive()] + [thread]
-        thread.start()
+        self._writing = threading.Thread(target=self._fill, args=(fault, fills), name="black box")
+        self._writing.start()
 
     def _fill(self, fault: Event, fills: list[Fill]) -> None:
         try:
             recorder = self._begin(box_name(fault.time), fault.message)
         except ServiceError as error:
-            words = f"black box: the minute before the fault is not saved: {error}"
-            self._warn(coded(words, EventCode.NO_BLACK_BOX, error=str(error)))
+            self._warn_unsaved(str(error))
             return
         for fill in fills:
             fill(recorder)

@@ -110,6 +110,7 @@ class EventCode(StrEnum):
     RECORDINGS_KEPT = "recordings_kept", "old recordings cannot be deleted", "error"
     NOT_INDEXED = "not_indexed", "the index of sessions cannot be written", "error"
     BLACK_BOX_INCOMPLETE = "black_box_incomplete", "parts of the minute before a fault are missing", "file", "error"
+    BLACK_BOX_LATER = "black_box_later", "faults repeat within a minute, and are saved in one file", "until"
     BLACK_BOX_SHORT = "black_box_short", "too many messages before a fault, the oldest are missing", "until"
     NO_BLACK_BOX = "no_black_box", "the minute before a fault cannot be kept", "error"
 
