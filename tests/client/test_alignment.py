@@ -18,7 +18,7 @@ from processes.test_service import told, until
 from trirail.alignment.calibration_procedure import DEFAULT_MOVES
 from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.images import CameraView, Pair, project_points
-from trirail.client import calibration_file
+from trirail.client import alignment, calibration_file
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.errors import AlignmentError, AlignmentFault, RefusedError, TrirailError
@@ -153,6 +153,37 @@ def test_ctrl_c_in_a_motion_stops_the_robot(locator: str) -> None:
         thread.join()
         assert until(robot, lambda state: state.mode == Mode.HOLDING).pose[0] < 0.045
         told(robot, lambda heard: ended(heard[-1]) == ("failed", "KeyboardInterrupt"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["pause", "override"])
+def test_a_motion_that_is_paused_for_longer_than_its_time_goes_on(
+    how: str, locator: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(alignment, "PROGRESS_WITHIN", 0.05)
+
+    def pause() -> None:
+        with Robot("demo", locator) as other:
+            for state in other.states(60.0):
+                if state.mode == Mode.MOVING and abs(state.pose[0]) > 1e-3:
+                    break
+            other.pause() if how == "pause" else other.override(0.0)
+            began = other.state().t
+            for state in other.states(60.0):
+                if state.t > began + 20.0 * alignment.PROGRESS_WITHIN:
+                    break
+            other.resume() if how == "pause" else other.override(100.0)
+
+    with Robot("demo", locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(60.0)
+        thread = threading.Thread(target=pause)
+        thread.start()
+        found = robot.calibrate_camera(
+            lambda: seen(PART, robot.state().pose), [(0.02, 0.0, 0.0), *DEFAULT_MOVES], speed=0.05
+        )
+        thread.join()
+        assert found.marks.keys() == PART.keys()
 
 
 def ended(event: Event) -> tuple[str | None, str] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,24 +34,33 @@ class Told:
         self.trouble: ServiceError | None = None
         self.begun: list[float] = []
         """Times at which procedures were announced [s]."""
-        self.takes = 1.0
-        """Duration of each motion [s]."""
+        self.progress: Sequence[tuple[str, float, float | None]] = ()
+        """Mode, override and progress of the goal after each of its time-outs; then it is done."""
+        self._goal = ""
+        self._states: Iterator[tuple[str, float, float | None]] = iter(())
+        self._shown: tuple[str, float, float | None] = ("holding", 1.0, None)
+        self.stops = 0
 
     def state(self) -> Any:
-        return SimpleNamespace(pose=self.stage.pose, sliders=SimpleNamespace(position=(0.0, 0.0, 0.0)))
+        mode, override, progress = self._shown
+        goal = None if progress is None else SimpleNamespace(id=self._goal, progress=progress)
+        sliders = SimpleNamespace(position=(0.0, 0.0, 0.0))
+        return SimpleNamespace(pose=self.stage.pose, sliders=sliders, mode=mode, override=override, goal=goal)
 
     def send(self, goal: Any) -> Any:
         motion = (goal.x, goal.y, goal.phi)
         self.stage.go(StageMotion(motion, getattr(goal, "tool", None)))
-        return SimpleNamespace(wait=self._wait, result=None, duration=self.takes)
+        self._goal, self._states = goal.id, iter(self.progress)
+        return SimpleNamespace(wait=self._wait, result=None)
 
     def _wait(self, timeout: float) -> Any:
-        if timeout < self.takes:
+        if (shown := next(self._states, None)) is not None:
+            self._shown = shown
             raise WaitTimeoutError(f"not ended within {timeout:g} s")
         return SimpleNamespace(outcome="done")
 
     def stop(self) -> None:
-        pass
+        self.stops += 1
 
     def _begin_call(self, began: float) -> None:
         self.begun.append(began)
@@ -71,10 +80,44 @@ class Told:
         return drive(self, check_begun, wishes, 1.0, 0.0)
 
 
-def test_a_slow_motion_has_its_time() -> None:
+@pytest.mark.parametrize(
+    "progress",
+    [
+        [("moving", 0.01, share) for share in (0.0, 0.1, 0.2, 0.3)],
+        [("holding", 1.0, 0.5)] * 9,
+        [("moving", 1.0, 0.3), *[("holding", 1.0, 0.5)] * 3, ("moving", 1.0, 0.5), ("moving", 1.0, 0.6)],
+        [("stopping", 1.0, 0.5), ("holding", 1.0, 0.5), ("holding", 1.0, 0.5), ("moving", 0.0, 0.5)],
+        [("moving", 0.0, 0.5)] * 9,
+        [("holding", 1.0, None)],
+    ],
+    ids=["slow", "paused", "paused and resumed", "paused at override 0", "override 0", "just ended"],
+)
+def test_a_motion_has_its_time_while_it_makes_progress_or_is_paused(
+    progress: Sequence[tuple[str, float, float | None]],
+) -> None:
     told = Told(1)
-    told.takes = 1000.0
+    told.progress = progress
     assert told.drive(calibrate_by_moves()).marks.keys() == PART.keys()
+    assert not told.stops
+
+
+@pytest.mark.parametrize(
+    ("progress", "words"),
+    [
+        ([("moving", 1.0, 0.5)] * 2, "no progress for 60 s, .*: it is at 50% of its path, and the robot is moving"),
+        ([("holding", 1.0, 0.5), *[("moving", 0.5, 0.5)] * 2], "at 50% of its path"),
+        ([("holding", 1.0, None)] * 2, "it is not the present goal, and the robot is holding"),
+    ],
+)
+def test_a_motion_that_makes_no_progress_without_a_pause_ends_it_and_stops(
+    progress: Sequence[tuple[str, float, float | None]], words: str
+) -> None:
+    told = Told(1)
+    told.progress = progress
+    with pytest.raises(WaitTimeoutError, match=words):
+        told.drive(calibrate_by_moves())
+    assert told.stops == 1
+    assert told.looks[-1].end == "failed"
 
 
 def task(told: Told, error: Triple) -> AlignmentTask:

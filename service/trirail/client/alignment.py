@@ -7,6 +7,7 @@ client warns once and continues the alignment.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import inspect
 import itertools
 import time
@@ -25,11 +26,12 @@ from trirail.alignment.camera_calibration import Marks
 from trirail.alignment.results import Measurement
 from trirail.client.call_time import called, called_at
 from trirail.client.goal import Result
-from trirail.errors import RefusalCode, RefusedError, TrirailError
+from trirail.errors import RefusalCode, RefusedError, TrirailError, WaitTimeoutError
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal
 from trirail.wire.looks import AlignmentLook, LookEnd, LookError, SeenMark
 from trirail.wire.state import State
 from trirail.wire.text import quoted
+from trirail.wire.vocabulary import Mode
 
 T = TypeVar("T")
 Look = Callable[[], Marks | Awaitable[Marks]]
@@ -37,8 +39,8 @@ Look = Callable[[], Marks | Awaitable[Marks]]
 
 A coroutine function is allowed with AsyncRobot only."""
 EMPTY_OBSERVATION = Observation({}, (0.0, 0.0, 0.0), 0.0)
-GOAL_WITHIN = 60.0
-"""Longest time from the expected end of a motion to its end [s]."""
+PROGRESS_WITHIN = 60.0
+"""Time in which a motion must make progress, unless it is paused or the override is 0 [s]."""
 ENDS_AT_TARGET = ("done", "unsettled")
 """Outcomes of a goal that leave the robot at or near its target. The next look measures the remaining distance."""
 
@@ -49,10 +51,6 @@ class MotionHandle(Protocol):
     @property
     def result(self) -> Result | None:
         """Result of the goal; None before its end."""
-
-    @property
-    def duration(self) -> float | None:
-        """Expected time from acceptance to the end of the path [s]; None at override zero."""
 
     def wait(self, timeout: float | None = None) -> Result | Awaitable[Result]:
         """Wait for the end of the goal."""
@@ -189,13 +187,38 @@ async def _move(robot: StageRobot, goal: Goal, goal_id: str, began: float) -> No
     try:
         with called(began):
             handle = await completed(robot.send(structs.replace(goal, id=goal_id)))
-        check(await completed(handle.wait((handle.duration or 0.0) + GOAL_WITHIN)))
+        check(await _wait_for_end(robot, handle, goal_id))
     except RefusedError:  # the goal was refused or has ended
         raise
     except BaseException:  # even without a reply, the goal may have been accepted
         if handle is None or handle.result is None:
             await completed(robot.stop())
         raise
+
+
+async def _wait_for_end(robot: StageRobot, handle: MotionHandle, goal_id: str) -> Result:
+    """Wait for the end of a goal, for as long as it makes progress, is paused, or the override is 0.
+
+    Raises WaitTimeoutError if the goal makes no progress for another reason.
+    """
+    before: float | None = None
+    while True:
+        with contextlib.suppress(WaitTimeoutError):
+            result: Result = await completed(handle.wait(PROGRESS_WITHIN))
+            return result
+        state: State = await completed(robot.state())
+        is_present = state.goal is not None and state.goal.id == goal_id
+        progress = state.goal.progress if state.goal is not None and is_present else -1.0
+        if is_present and (state.mode != Mode.MOVING or state.override == 0.0):
+            before = None
+        elif progress == before:
+            status = f"it is at {progress:.0%} of its path" if is_present else "it is not the present goal"
+            raise WaitTimeoutError(
+                f"goal {goal_id} has made no progress for {PROGRESS_WITHIN:g} s, without a pause: {status}, and the "
+                f"robot is {state.mode}"
+            )
+        else:
+            before = progress
 
 
 def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:
