@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -40,6 +40,8 @@ SUSPICIOUS_NOISE_PX = 1.0
 """Noise above which marks may be swapped in a sample [pixel]. Marks are located with a noise of about 0.1 pixel."""
 MAX_SWAP_NOISE_SHARE = 0.1
 """Two marks count as swapped if exchanging them reduces the noise to this fraction or less."""
+MAX_SWAP_FITS = 12
+"""Greatest number of swaps that are checked by a fit, in the order of their likelihood."""
 MIN_TURN_SHARE = 0.01
 """Least share of the rotation of all looks over which a mark must have been found, so that its position is known."""
 MAX_CONDITION = 1e6
@@ -157,7 +159,7 @@ def calibrate(
         failure = error
     if noise > SUSPICIOUS_NOISE_PX:
         # Few moves leave little redundancy, so the fit can absorb most of a swap. Only a fit without the swap shows it.
-        for number, one, other in _possible_swaps(samples):
+        for number, one, other in _likely_swaps(samples, views):
             exchanged = [*samples]
             marks = samples[number].marks
             exchanged[number] = samples[number]._replace(marks={**marks, one: marks[other], other: marks[one]})
@@ -176,11 +178,47 @@ def calibrate(
     return calibration
 
 
-def _possible_swaps(samples: Sequence[CalibrationSample]) -> Iterator[tuple[int, str, str]]:
-    """Yield the index of a sample and the names of two of its marks, for every pair of marks."""
-    for number, sample in enumerate(samples):
-        for one, other in itertools.combinations(sorted(sample.marks), 2):
-            yield number, one, other
+def _likely_swaps(samples: Sequence[CalibrationSample], views: Mapping[str, str] | None) -> list[tuple[int, str, str]]:
+    """Return the MAX_SWAP_FITS most likely swaps: the index of a sample and the names of two of its marks.
+
+    A fit to every pair of marks in every sample would take half a minute for 20 marks. The linear model of the pixels
+    ranks them: in it, the sum of squared residuals after a swap follows from the residuals before.
+    """
+    rows = [(number, name) for number, sample in enumerate(samples) for name in sorted(sample.marks)]
+    if not rows:
+        return []
+    seen = np.array([samples[number].marks[name] for number, name in rows]).reshape(-1, 2)
+    design = _linear_design(samples, rows, views)
+    scaled = design / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    left, values, _ = np.linalg.svd(scaled, full_matrices=False)
+    left = left[:, values > 1e-9 * values[0]]
+    free = np.eye(len(rows)) - left @ left.T  # residuals of any pixels
+    residuals = free @ seen
+    swaps = []
+    for _, group in itertools.groupby(range(len(rows)), lambda row: rows[row][0]):
+        for a, b in itertools.combinations(group, 2):
+            apart = seen[b] - seen[a]
+            change = 2.0 * apart @ (residuals[a] - residuals[b])
+            change += apart @ apart * (free[a, a] + free[b, b] - 2.0 * free[a, b])
+            swaps.append((float(change), (*rows[a], rows[b][1])))
+    return [swap for _, swap in sorted(swaps)[:MAX_SWAP_FITS]]
+
+
+def _linear_design(
+    samples: Sequence[CalibrationSample], rows: Sequence[tuple[int, str]], views: Mapping[str, str] | None
+) -> Floats:
+    """Return the design matrix of the linear model of _ViewFit, for all views. Each row is a sample and a mark."""
+    names = sorted({name for _, name in rows})
+    view_of = [name if views is None else views.get(name, name) for name in names]
+    shown = sorted(set(view_of))
+    design = np.zeros((len(rows), 2 * len(shown) + 2 * len(names)))
+    first = samples[0].pose
+    for row, (number, name) in enumerate(rows):
+        pose, mark = samples[number].pose, names.index(name)
+        view, place = 2 * shown.index(view_of[mark]), 2 * len(shown) + 2 * mark
+        design[row, view : view + 2] = np.subtract(pose[:2], first[:2])
+        design[row, place : place + 2] = 1.0, math.sin(pose[2] - first[2])
+    return design
 
 
 def fit_cameras(
