@@ -35,6 +35,7 @@ from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.recording import Recording
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import MODES, Mode
 
 SHIPPED = sorted(path for path in SIM.parent.glob("*.toml"))
 SINGULAR = singular_angles(config.geometry(load(SIM).geometry))[0]
@@ -148,6 +149,25 @@ def test_modes_and_faults_are_diagnostics(recording: Recording, exported: Path) 
     assert {pair.key: pair.value for pair in statuses[1].values} == {
         "cause": "emcy", "drive": "B", "code": str(0x8611), "t": "0.4",
     }  # fmt: skip
+
+
+@given(changed=st.sets(st.integers(0, 499)), every=st.sampled_from([None, 1e-3, 0.01, 0.0375, 1.0]))
+def test_no_change_of_the_mode_is_lost_if_the_rows_are_fewer(
+    recording: Recording, changed: set[int], every: float | None
+) -> None:
+    """Some modes last for one cycle."""
+    records = recording.records.copy()
+    for row in changed:
+        records["mode"][row] = MODES.index(Mode.ENABLING)
+    rows = [row for row, mode in enumerate(records["mode"]) if not row or mode != records["mode"][row - 1]]
+    made = list(mcap.messages(recording._replace(records=records), config.geometry(load(SIM).geometry), every))
+    statuses = [(wall, message.status[0]) for wall, topic, message in made if topic == "/diagnostics"]
+    walls = recording.wall.astype(np.int64)
+    assert [(wall, status.message) for wall, status in statuses if status.name == "trirail: mode"] == [
+        (walls[row], MODES[records["mode"][row]]) for row in rows
+    ]
+    kept = recording.part(every=every).wall.astype(np.int64).tolist()
+    assert [wall for wall, topic, _ in made if topic == "/pose"] == kept
 
 
 def test_velocities_are_those_of_the_positions(recording: Recording) -> None:

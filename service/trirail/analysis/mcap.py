@@ -63,11 +63,14 @@ Message = tuple[int, str, Any]
 """Wall-clock time [ns], topic and message."""
 
 
-def write(recording: Recording, path: Path) -> int:
+def write(recording: Recording, path: Path, every: float | None = None) -> int:
     """Write a recording as one MCAP file; return the number of messages.
 
-    Each message has the wall-clock time of the record or the log line from which it is made. Raises ServiceError if the
-    file already exists or cannot be written, if the recording has no configuration, or if its clock was not set.
+    Each message has the wall-clock time of the record or the log line from which it is made. `every` is the interval of
+    the joint states and poses [s]; None for those of all cycles.
+
+    Raises ServiceError if the file already exists or cannot be written, if the recording has no configuration, if its
+    clock was not set, or if `every` is not positive.
     """
     _check_clock(recording)
     settings = provenance.configuration(recording.texts)
@@ -75,20 +78,21 @@ def write(recording: Recording, path: Path) -> int:
         raise ServiceError(f"{recording.name}: MCAP needs the configuration, which this recording does not contain")
     geometry = config.corrected_geometry(settings)
     with new_file(path), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-") as folder:
-        count = _write_bag(Path(folder, "bag"), messages(recording, geometry))
+        count = _write_bag(Path(folder, "bag"), messages(recording, geometry, every))
         Path(folder, "bag/bag.mcap").replace(path)
     return count
 
 
-def messages(recording: Recording, geometry: Geometry) -> Iterator[Message]:
-    """Yield the messages of a recording, in order of time.
+def messages(recording: Recording, geometry: Geometry, every: float | None = None) -> Iterator[Message]:
+    """Yield the messages of a recording, in order of time; the parameter `every` is that of `write`.
 
     The messages of the cycles are made one after the other: together they need 4 kB of memory per cycle, which is
     14 GB for an hour at 1 kHz. Only the few messages of the events are sorted.
     """
     time = itemgetter(0)
-    others = sorted([*_log(recording), *_diagnostics(recording)], key=time)
-    return heapq.merge(_motion(recording, geometry), others, key=time)
+    others = sorted([*_log(recording), *_diagnostics(recording)], key=time)  # modes may last less than `every`
+    thinned = recording if every is None else recording.part(every=every)
+    return heapq.merge(_motion(thinned, geometry), others, key=time)
 
 
 def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

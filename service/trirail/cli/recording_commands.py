@@ -125,7 +125,7 @@ def export(
     end
         Last time to write.
     every
-        Write one row per interval, the first in each: 10ms.
+        Write one row per interval, the first in each: 10ms. MCAP has every change of the mode and every event.
     columns
         Names of columns, or words in their names, separated by commas: pose,error. If absent, all columns.
     goal
@@ -145,9 +145,9 @@ def export(
     if switches and (every is not None or wanted or path.suffix == ".mcap"):
         raise ServiceError("--switches writes a table with one row per switch: omit --every, --columns and MCAP")
     recording = _read(file)
-    part = recording.part(begin, end, goal=goal, every=every)
+    part = recording.part(begin, end, goal=goal)
     if path.suffix == ".mcap":
-        unit, count = "messages", _write_mcap(part, path)
+        unit, count = "messages", _write_mcap(part, path, every)
     elif switches:
         from trirail.analysis.export import write_switches
 
@@ -155,7 +155,7 @@ def export(
     else:
         from trirail.analysis.export import write
 
-        unit, count = "rows", write(part, path, wanted)
+        unit, count = "rows", write(part.part(every=every), path, wanted)
     if json:
         terminal.json({"file": str(path), unit: count})
     else:
@@ -192,14 +192,14 @@ def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json =
     return 0
 
 
-def _write_mcap(recording: Recording, path: Path) -> int:
+def _write_mcap(recording: Recording, path: Path, every: float | None) -> int:
     try:
         from trirail.analysis import mcap
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "rosbags":
             raise
         raise TrirailError("MCAP needs rosbags: pip install 'trirail[mcap]'") from error
-    return mcap.write(recording, path)
+    return mcap.write(recording, path, every)
 
 
 def _read(files: tuple[Path, ...]) -> Recording:
