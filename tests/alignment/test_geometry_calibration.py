@@ -338,6 +338,24 @@ def test_a_check_after_the_calibration_of_the_geometry_tells_small_shifts(seed: 
     assert abs(right_change.shift[0] - way) < 6.0 * right_change.shift_deviation[0]
 
 
+@pytest.mark.parametrize("lens", ["affine", "radial"])
+@pytest.mark.generated(4, 0, 3, 7)
+def test_cameras_with_little_or_no_distortion_are_checked_as_precisely_as_others(seed: int, lens: Lens) -> None:
+    """The lens of seed 4 has little distortion. The centre of such a lens is not determined, and was 90,000 px away."""
+    made, task = stage("uvw", seed, noise=0.1, lens=lens)
+    found = made.drive(calibrate_geometry(task._replace(lens="radial")))
+    made.configured, made.scales = found.geometry, (1.0 + made.scales) / (1.0 + np.array(found.scales)) - 1.0
+    made.pose = (0.0, 0.0, 0.0)
+    poses = poses_within(task.room, found.geometry, found.cameras)
+    changes = compare_views(found.cameras, made.drive(repeat_calibration(found.cameras, 1, poses)))
+    assert len(changes) == 2
+    for change in changes:
+        assert not change.is_changed
+        assert change.scale_deviation < 1e-4
+    for view in found.cameras.views.values():
+        assert math.dist(view.centre, (FIELD[0] / 2.0, FIELD[1] / 2.0)) < math.hypot(*FIELD) / 4.0
+
+
 def test_planned_poses_tell_more_than_random_ones_and_keep_marks_in_the_pictures() -> None:
     made, task = stage("uvw", 6, noise=0.05)
     found = made.drive(calibrate_geometry(task))

@@ -5,6 +5,8 @@ The noise is estimated from the median of the residuals. A first fit with a robu
 fits, the drawings are treated as an additional observation of each correction, with the standard deviations
 StageModel.doubts. If the corrections are greater on average, these standard deviations are increased to their root mean
 square: a stage that was homed 1 mm off would otherwise be held back, and would look as if no geometry explained it.
+In the same way, the middle of the picture is an additional observation of the centre of a radial lens, which looks do
+not determine if the lens has no distortion.
 """
 
 from __future__ import annotations
@@ -71,6 +73,8 @@ def fit_stage(
     if fixed_legs:  # with wrong legs, correct observations could appear as outliers: use all observations
         free = np.eye(model.size)[:, model.legs :]
         unknowns = _minimise(model, looks, unknowns, used, free, 1.0, 1.0, robust=False)
+        noise = max(float(np.sqrt((model.residuals(unknowns, looks) ** 2).mean())), MIN_NOISE_PX)
+        unknowns = _minimise(model, looks, unknowns, used, free, noise, 1.0, robust=False)
         return _result(model, looks, unknowns, used, free, 1.0)
     unknowns = _minimise(model, looks, unknowns, used, np.eye(model.size), 1.0, 1.0, robust=True)
     noise, free = math.inf, model.size
@@ -119,17 +123,17 @@ def _result(
     residuals, legs = model.residuals(unknowns, looks), model.legs
     freedom = max(2 * int(used.sum()) - basis.shape[1], 1)
     noise = float(np.sqrt((residuals[used] ** 2).sum() / freedom))
-    drawings = noise / doubt * np.eye(legs, model.size) @ basis
-    covariance = _covariance(model.jacobian(unknowns, looks)[used], basis, drawings, noise)
+    expected = noise * model.expected(doubt)[0] @ basis
+    covariance = _covariance(model.jacobian(unknowns, looks)[used], basis, expected, noise)
     determined = basis[:legs, : basis.shape[1] - (model.size - legs)]
     # A parameter with a small share of an undetermined combination is as uncertain as this share of the drawings.
     covariance[:legs, :legs] += doubt**2 * (np.eye(legs) - determined @ determined.T)
     return StageFit(unknowns, covariance, determined, noise, residuals, used)
 
 
-def _covariance(jacobian: Floats, basis: Floats, drawings: Floats, noise: float) -> Floats:
+def _covariance(jacobian: Floats, basis: Floats, expected: Floats, noise: float) -> Floats:
     rows = jacobian.reshape(-1, len(basis)) @ basis
-    information = np.concatenate([rows, drawings])
+    information = np.concatenate([rows, expected])
     scales = np.maximum(np.linalg.norm(information, axis=0), 1e-300)
     inverse = np.linalg.pinv(information / scales)
     return np.asarray(basis @ ((inverse @ inverse.T) / np.outer(scales, scales)) @ basis.T * noise**2)
@@ -139,7 +143,7 @@ def camera_covariance(model: StageModel, looks: Sequence[StageLook], fit: StageF
     """Return the covariance of cameras and marks for known legs, (size, size); zero for the legs."""
     cameras = np.eye(model.size)[:, model.legs :]
     jacobian = model.jacobian(fit.unknowns, looks)[fit.used]
-    return _covariance(jacobian, cameras, np.zeros((0, cameras.shape[1])), fit.noise)
+    return _covariance(jacobian, cameras, fit.noise * model.expected(1.0)[0] @ cameras, fit.noise)
 
 
 def leg_information(model: StageModel, jacobian: Floats) -> Floats:
@@ -180,14 +184,15 @@ def _minimise(
 
     # The drawings are an additional observation of each correction. Otherwise, the noise of a small number of looks
     # would cause large corrections of the legs.
-    prior = np.eye(model.legs, model.size) @ basis / doubt
+    rows, values = model.expected(doubt)
+    away, prior = rows @ unknowns - values, rows @ basis
 
     def residuals(step: Floats) -> Floats:
         try:
             seen = model.residuals(unknowns + basis @ step, looks)[used].ravel() / noise
         except KinematicsError:
             return np.full(2 * int(used.sum()) + len(prior), np.inf)  # the solver will shorten the step
-        return np.concatenate([seen, unknowns[: model.legs] / doubt + prior @ step])
+        return np.concatenate([seen, away + prior @ step])
 
     def jacobian(step: Floats) -> Floats:
         rows = model.jacobian(unknowns + basis @ step, looks)[used].reshape(-1, model.size) @ basis / noise

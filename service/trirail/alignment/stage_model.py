@@ -18,6 +18,7 @@ mean of the three encoder scales. Parameters that compensate each other keep the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -35,6 +36,10 @@ from trirail.kinematics.robot import forward, inverse, jacobians
 LENGTH_DOUBT_M, ANGLE_DOUBT_RAD, SCALE_DOUBT = 2e-4, 5e-4, 5e-4
 """Standard deviations of the parameters in drawings and data sheets. A fit with greater standard deviations has no
 benefit."""
+CENTRE_DOUBT_SHARE = 0.1
+"""Standard deviation of the centre of a radial lens from the middle of the picture, as a fraction of the distance from
+the middle to a corner. Without it, the fit could put the centre of a lens without distortion anywhere, such as 60,000
+pixels away, where the small moves of a later calibration no longer determine the map."""
 INVISIBLE = 1e-9
 """Singular value, relative to the greatest singular value, below which a change has no effect on any look."""
 LENS_NUMBERS = {"affine": 0, "perspective": 2, "radial": 3}
@@ -76,7 +81,8 @@ class StageModel:
     samples
         Poses within the travel of the stage, (N, 3) [m, rad], from which the invisible changes are determined.
     views, places
-        First estimates of the cameras and of the positions of the marks on the platform.
+        First estimates of the cameras and of the positions of the marks on the platform. The first estimate of the
+        centre of a radial lens is the middle of the picture.
     view_of
         Name of the view of each mark.
     """
@@ -118,6 +124,20 @@ class StageModel:
     def mark_unknowns(self, name: str) -> slice:
         """Return the slice of the unknowns for the position of a mark."""
         return slice(self._mark_at[name], self._mark_at[name] + 2)
+
+    def expected(self, doubt: float) -> tuple[Floats, Floats]:
+        """Return what is known without looks: rows (n, size), and the values (n,) of their products with the unknowns.
+
+        Both are in standard deviations. The corrections of the legs are 0, with the deviations `doubts` times `doubt`.
+        The centre of a radial lens is the middle of the picture, which is its first estimate.
+        """
+        rows, values = [*np.eye(self.legs, self.size) / doubt], [0.0] * self.legs
+        for name, view in self.views.items():
+            if view.lens == "radial":
+                deviation = CENTRE_DOUBT_SHARE * math.hypot(*view.centre)
+                rows += [*np.eye(self.size)[self.view_unknowns(name)][-2:] / deviation]
+                values += [each / deviation for each in view.centre]
+        return np.array(rows).reshape(-1, self.size), np.array(values)
 
     def initial(self) -> Floats:
         """Return the unknowns (size,) for the configured legs and the first estimates of views and marks."""
