@@ -106,6 +106,39 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     assert "distance between marks" in " ".join(refused.split())
 
 
+@pytest.mark.slow
+def test_a_calibration_is_kept_if_the_look_after_it_fails_or_its_file_cannot_be_written(
+    locator: str, tmp_path: Path
+) -> None:
+    script, part, kept = tmp_path / "marks.py", tmp_path / "part.json", tmp_path / "camera.json"
+    ends = MARKS.replace("    for _ in", "    for number, _ in").replace("sys.stdin:", "enumerate(sys.stdin):")
+    ends = ends.replace("        pose, seen", "        if number == 7: sys.exit(7)\n        pose, seen")
+    script.write_text(ends, encoding="utf-8")
+    part.write_text(json.dumps({"left": [-0.06, 0.01], "right": [0.06, 0.01]}), encoding="utf-8")
+    with Robot("demo", locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN)
+    marks = ("--program", f"{sys.executable} {script} {locator} {part}", "--connect", locator)
+    done = trirail("align", "calibrate", kept, *marks, code=1)
+    said = " ".join(done.stderr.split())
+    assert "the look after the last move has failed: " in said
+    assert "has ended with exit code 7" in said
+    assert "the targets are the computed positions of the marks" in said
+    assert f"kept in {kept}" in " ".join(done.stdout.split())
+    targets = calibration_file.read(kept).targets
+    assert targets["left"] == pytest.approx((900.0, 700.0), abs=20.0)
+    assert targets["right"] == pytest.approx((900.0, 700.0), abs=20.0)
+    kept.with_name("camera.json.old").mkdir()  # the calibration that is replaced cannot be saved
+    script.write_text(MARKS, encoding="utf-8")
+    before = kept.read_text(encoding="utf-8")
+    done = trirail("align", "calibrate", kept, *marks, "--json", code=1)
+    found = json.loads(done.stdout)
+    assert "camera.json.old" in found["errors"][0]
+    assert (found["file"], kept.read_text(encoding="utf-8")) == (None, before)
+    assert found["calibration"]["views"].keys() == found["targets"].keys() == {"left", "right"}
+    assert "camera.json.old" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("program", "words"),
     [

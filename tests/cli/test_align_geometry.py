@@ -130,6 +130,22 @@ def test_a_stage_finds_its_geometry_and_writes_a_configuration_when_it_is_told_t
 
 
 @pytest.mark.slow
+def test_a_measurement_is_kept_if_the_look_after_it_fails(stage: tuple[Path, str], tmp_path: Path) -> None:
+    given, out, camera = options(stage, tmp_path), tmp_path / "new.toml", tmp_path / "camera.json"
+    ends = MARKS.replace("    for _ in", "    for number, _ in").replace("sys.stdin:", "enumerate(sys.stdin):")
+    ends = ends.replace("        pose, seen", "        if number == 14 * 4: sys.exit(7)\n        pose, seen")
+    (tmp_path / "marks.py").write_text(ends, encoding="utf-8")
+    done = warm.trirail("align", "geometry", *given, "--out", out, "--yes", "--json", "--looks", "4")
+    assert done.returncode == 1, done.stderr
+    found = json.loads(done.stdout)
+    assert found["written"]["config"] == str(out)
+    assert "the targets are the computed positions of the marks" in found["errors"][0]
+    assert load(out)
+    targets = calibration_file.read(camera).targets
+    assert targets["left"] == pytest.approx((4672.0, 3500.0), abs=2000.0)
+
+
+@pytest.mark.slow
 def test_pictures_that_are_one_late_end_with_an_error_and_change_no_file(
     stage: tuple[Path, str], tmp_path: Path
 ) -> None:

@@ -11,6 +11,7 @@ from cyclopts import App
 
 from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.align_geometry import geometry
+from trirail.cli.alignment_targets import observe_targets
 from trirail.cli.mark_source import MarkSource
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
@@ -63,7 +64,7 @@ def calibrate(
     approach
         Distance X Y PHI [m, rad] to go beyond each place first, so that backlash is always on the same side.
     """
-    from trirail.alignment.procedure import calibrate_by_moves, calibration_moves, observe_mean
+    from trirail.alignment.procedure import calibrate_by_moves, calibration_moves
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
     from trirail.client.stage_geometry import geometry_id
@@ -75,27 +76,34 @@ def calibrate(
     calibration_file.check_replaceable(file)
     moves = calibration_moves(lens, by, notation.radians(angle, False))
     with source.open_source() as (look, known), service.open() as robot:
-        views = dict.fromkeys(look(), "camera") if one_camera else known
+        views, made_with = dict.fromkeys(look(), "camera") if one_camera else known, geometry_id(robot.info())
         requests = calibrate_by_moves(moves, views, lens, centre, source.looks, _approach(approach))
         calibration = drive(robot, look, _with_progress(requests, service, len(moves) + 1), source.speed, source.wait)
-        targets = dict(drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks)
-        made_with = geometry_id(robot.info())
-    old = calibration_file.keep_old(file)
-    calibration_file.write(file, service.robot, calibration, targets, geometry=made_with)
-    if service.json:
-        terminal.json(
-            {
-                "file": str(file),
-                "old": str(old) if old else None,
-                "targets": targets,
-                "calibration": msgspec.to_builtins(calibration),
-            }
-        )
-    else:
+        targets, failures = observe_targets(robot, look, source, calibration)
+    old, is_written = None, False
+    try:
+        old = calibration_file.keep_old(file)
+        calibration_file.write(file, service.robot, calibration, targets, geometry=made_with)
+        is_written = True
+    except TrirailError as error:
+        failures.append(error)
+    if is_written and not service.json:
         alignment_lines.show_calibration(calibration, file)
         if old is not None:
             terminal.print_line(f"the previous file is now {old}")
-    return 0
+    else:
+        terminal.json(
+            {
+                "file": str(file) if is_written else None,
+                "old": str(old) if old else None,
+                "targets": targets,
+                "calibration": msgspec.to_builtins(calibration),
+                "errors": [str(each) for each in failures],
+            }
+        )
+    for failure in failures:
+        terminal.print_error(str(failure))
+    return 1 if failures else 0
 
 
 @app.command
@@ -147,13 +155,17 @@ def run(
             _approach(approach),
         )
         result = drive(robot, look, _with_progress(align(task), service), source.speed, source.wait)
-    if result.confirmed != known.confirmed:
-        known = msgspec.structs.replace(known, confirmed=result.confirmed)
-        calibration_file.write(file, kept.robot, known, kept.targets, kept.made, now)
     if service.json:
         terminal.json({"reached": result.reached} | msgspec.to_builtins(result))
     else:
         alignment_lines.show_alignment(result)
+    if result.confirmed != known.confirmed:
+        known = msgspec.structs.replace(known, confirmed=result.confirmed)
+        try:
+            calibration_file.write(file, kept.robot, known, kept.targets, kept.made, now)
+        except TrirailError as error:  # the result is already printed, and a program expects one object of JSON
+            terminal.print_error(str(error))
+            return 1
     return 0 if result.reached else 1
 
 

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from trirail_drivers import files
 
 from trirail.cli import alignment_lines, notation, terminal
+from trirail.cli.alignment_targets import observe_targets
 from trirail.cli.mark_source import MarkSource
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import ConfigError, TrirailError
@@ -76,7 +77,6 @@ def geometry(
     yes
         Write the files without asking.
     """
-    from trirail.alignment.procedure import observe_mean
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
     from trirail.client.stage_geometry import geometry_task
@@ -93,18 +93,18 @@ def geometry(
         _check_same(settings, config, robot)
         views = dict.fromkeys(look(), "camera") if one_camera else known
         task = geometry_task(robot.info(), field, views, lens, poses, source.looks, way if any(way) else None)
+        taught = sorted(name for name, pose in robot.poses().items() if pose.taught)
         from trirail.alignment.geometry_calibration import calibrate_geometry
 
         wishes = calibrate_geometry(task)
         shown = wishes if service.json else alignment_lines.print_looks(wishes, poses)
         result = drive(robot, look, shown, source.speed, source.wait)
-        targets = drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks
-        taught = sorted(name for name, pose in robot.poses().items() if pose.taught)
+        targets, failures = observe_targets(robot, look, source, result.cameras)
     if not service.json:
         alignment_lines.show_geometry(result, settings.geometry.labels)
     asks = not yes and not service.json
     usable = _usable_map(result, settings, quiet=service.json)
-    written, failures = _Written(), list[TrirailError]()
+    written = _Written()
     if result.is_significant:
         question = "Write a new configuration with these values?"
     else:
@@ -114,7 +114,8 @@ def geometry(
     if not needless and (yes or (asks and _answers_yes(question))):
         if asks and usable is not None and not _answers_yes("Write the map too, as [correction] map?"):
             usable = None
-        written, failures = _write(result, config, settings, out, calibration, targets, usable)
+        written, unwritten = _write(result, config, settings, out, calibration, targets, usable)
+        failures += unwritten
     remarks = _remarks(settings, taught) if written.config is not None else []
     if service.json:
         files = {name: None if path is None else str(path) for name, path in written._asdict().items()}
