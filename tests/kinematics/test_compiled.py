@@ -226,3 +226,26 @@ def test_who_compiles_is_told_of_each_function_once(room: Path, tmp_path: Path) 
     )
     assert run(code, tmp_path).split() == ["kept", "other", "2"]
     assert run(code, tmp_path).split() == ["2"]
+
+
+def test_only_functions_that_say_so_create_arrays(room: Path, tmp_path: Path) -> None:
+    source = (
+        "import numpy as np\n"
+        "from trirail.kinematics.compiled import compiled\n"
+        "@compiled('f8(i8)'{})\n"
+        "def total(n):\n"
+        "    return np.ones(n).sum()\n"
+    )
+    code = "from trirail.kinematics.closure import total; print(total(3))"
+    (room / "closure.py").write_text(source.format(", allocates=True"))
+    assert run(code, tmp_path) == "3.0"
+    (room / "closure.py").write_text(source.format(""))
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        run(code, tmp_path)
+    assert "np.ones(n)" in refused.value.stderr
+
+
+@pytest.mark.parametrize("folder", ["kinematics", "control", "processes"])
+def test_no_function_of_a_cycle_creates_arrays(folder: str) -> None:
+    files = (Path(compiled.__file__).parents[1] / folder).rglob("*.py")
+    assert not [file.name for file in files if "@compiled" in (text := file.read_text()) and "allocates=True" in text]

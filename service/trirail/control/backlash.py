@@ -16,6 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from trirail.kinematics.algebra import copy_vector
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.motion.backlash_reserve import TakeUp
@@ -116,8 +117,10 @@ def taking_up(states: NDArray[np.void]) -> bool:
 @compiled()
 def keep_offset(states: NDArray[np.void]) -> None:
     """Append the offset in the setpoints of the previous cycle to the stored past offsets."""
-    states[0].offsets[:-1] = states[0].offsets[1:]
-    states[0].offsets[-1] = states[0].offset
+    offsets = states[0].offsets
+    for n in range(1, OFFSETS_KEPT):
+        copy_vector(offsets[n], offsets[n - 1])
+    copy_vector(states[0].offset, offsets[-1])
 
 
 @compiled()

@@ -43,6 +43,7 @@ from trirail_drivers.interface import PowerState
 
 from trirail.control.backlash import BACKLASH, add_offset, due_offset, keep_offset, release_offsets, taking_up
 from trirail.control.in_position import MONITOR, monitor
+from trirail.kinematics.algebra import copy_vector
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.closed_forward import forward_into
 from trirail.kinematics.closure import inverse_motion
@@ -154,8 +155,9 @@ def observe(
 
     """
     now, before, row = feedback[0], feedback[1], record[0]
-    written[:-1] = written[1:]
-    written[-1] = row.commanded_position
+    for n in range(1, len(written)):
+        copy_vector(written[n], written[n - 1])
+    copy_vector(row.commanded_position, written[-1])
     keep_offset(backlash)
     beyond, jumping = 0, False
     for i in range(3):
@@ -180,7 +182,7 @@ def observe(
     row.homing = now.homing
     known = not jumping and forward_into(legs, scratch[0], scratch[1], scratch[1]) == 0
     if known:
-        row.pose[:] = scratch[1]
+        copy_vector(scratch[1], row.pose)
     monitor(record, known and not taking_up(backlash), at_rest, monitored)
     feedback[1] = feedback[0]
     return beyond
@@ -235,8 +237,17 @@ def _solve(
     code = gate(bounds, sliders[1], sliders[0], motion[0], motion[1], refused_values)
     if code:
         return 3 + code
-    sliders[0], backlash[0] = sliders[1], backlash[1]
+    for k in range(6):
+        copy_vector(sliders[1, k], sliders[0, k])
+    backlash[0] = backlash[1]
     return 0
+
+
+@compiled()
+def _keep_motion(motion: Array) -> None:
+    """Let the commanded motion become that of the previous cycle."""
+    for k in range(3):
+        copy_vector(motion[0, k], motion[1, k])
 
 
 @compiled()
@@ -305,7 +316,7 @@ def command(
     """
     law = law_at(law_knots, law_pieces, time)
     s, rate, _ = law
-    motion[1] = motion[0]
+    _keep_motion(motion)
     if platform_at(legs, knots, pieces, in_sliders, tools, law, motion[1, 0], motion[0]) != 0:
         motion[0] = math.nan
     if bounds[0].allowed == _BRAKING and target == 0.0:
@@ -336,7 +347,7 @@ def hold(
     record: NDArray[np.void],
 ) -> int:
     """Solve the slider positions for a platform at rest. The result has the same coding as the result of `command`."""
-    motion[1] = motion[0]
+    _keep_motion(motion)
     refused = _solve(legs, bounds, motion, sliders, backlash, refused_values)
     _record_command(motion, sliders, 0.0, 0.0, record)
     return 4 * refused
@@ -383,9 +394,10 @@ def follow(
     release_offsets(backlash)
     now, row = feedback[0], record[0]
     motion[0] = 0.0
-    motion[0, 0] = row.pose
+    copy_vector(row.pose, motion[0, 0])
     if inverse_motion(legs, motion[0], sliders[1]) == 0:
-        sliders[0, 3:] = sliders[1, 3:]
+        for k in range(3, 6):
+            copy_vector(sliders[1, k], sliders[0, k])
     for i in range(3):
         position, last = now.position[i], sliders[0, 0, i]
         if not now.follows[i]:

@@ -18,6 +18,7 @@ from trirail_drivers.interface import NAMES
 
 from trirail.config import Input, Output
 from trirail.errors import RefusalCode, RefusedError
+from trirail.kinematics.algebra import copy_vector
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.motion.marks import GoalMarks, pulse_cycles
@@ -108,8 +109,8 @@ def _note(
         row = log[number]
         row.cycle, row.output, row.on, row.goal, row.mark, row.closed = cycle, output, on, goal, mark, 0
         row.deadline_ns = deadline_ns
-        row.commanded[:] = record[0].commanded_pose
-        row.measured[:] = record[0].pose
+        copy_vector(record[0].commanded_pose, row.commanded)
+        copy_vector(record[0].pose, row.measured)
     return min(number + 1, len(log))
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
+
+from numpy.typing import NDArray
 
 from trirail.kinematics.arrays import Matrix, Vector
 from trirail.kinematics.compiled import inlined
 
 __all__ = [
     "add",
+    "copy_vector",
     "cross",
     "dot",
     "plus_u3",
@@ -19,6 +23,13 @@ __all__ = [
     "transposed_times",
     "turned",
 ]
+
+
+@inlined
+def copy_vector(x: NDArray[Any], out: NDArray[Any]) -> None:
+    """Copy x (n,) into `out` (n,). An assignment to `out[:]` would need memory, because the arrays might overlap."""
+    for i in range(len(out)):
+        out[i] = x[i]
 
 
 @inlined

@@ -160,18 +160,23 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     Use this for a few lines of arithmetic. If all functions were inlined, compilation would take three times as long,
     and the code would not run faster.
     """
-    return _cached(function, forceinline=True)  # type: ignore[no-any-return]
+    return _cached(function, forceinline=True, _nrt=False)  # type: ignore[no-any-return]
 
 
-def compiled(*signatures: Any, releases: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def compiled(
+    *signatures: Any, releases: bool = False, allocates: bool = False
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function immediately for the given signatures or, without signatures, at its first call (decorator).
 
     Division by zero gives an infinity or NaN, never an exception. Compiled code is cached on disk, and later processes
     load the code from the cache. If `releases` is set, the function releases the GIL during a call.
+
+    Only functions with `allocates` may create arrays or return them. In the others, numba counts no references to
+    arrays. In the functions of a cycle, counting would take longer than the mathematics.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        dispatcher = _cached(function, nogil=releases)
+        dispatcher = _cached(function, nogil=releases, _nrt=allocates)
         kept = dispatcher._cache._cache_file
         if signatures:
             # If two processes start together, the second process loads the code that the first has compiled.

@@ -59,7 +59,7 @@ def _samples_in_piece(duration: float) -> int:
     return int(min(max(duration / PIECE_SAMPLE_INTERVAL_S, MIN_SAMPLES_IN_PIECE), MAX_SAMPLES_IN_PIECE))
 
 
-@compiled()
+@compiled(allocates=True)
 def _sample_times(
     knots: Array, law_knots: Array, law_pieces: Array, first: float, until: float, even: int, step: float
 ) -> Array:
@@ -130,7 +130,7 @@ class PathProblem(NamedTuple):
     shares: Array
 
 
-@compiled()
+@compiled(allocates=True)
 def _initialise_reach(problem: PathProblem, time: float, near: Array, tolerance: Array) -> int:
     """Set `reach` for a path that begins at a time of the law.
 
@@ -158,7 +158,7 @@ def _narrow_reach(problem: PathProblem, motion: Array, sliders: Array) -> None:
         problem.reach[1, i] = max(problem.box[1, i], min(problem.reach[1, i], position))
 
 
-@compiled()
+@compiled(allocates=True)
 def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sliders: Array) -> bool:
     """Write the motion of the platform and the sliders at a time of the law. Return True if they are within reach."""
     law = law_at(problem.law_knots, problem.law_pieces, time)
@@ -204,7 +204,7 @@ def _find_zero(
     return middle, True
 
 
-@compiled()
+@compiled(allocates=True)
 def _find_turn_beyond_limit(
     problem: PathProblem, last: float, time: float, near: Array, motion: Array, sliders: Array
 ) -> float:
@@ -341,7 +341,7 @@ def _measure_rates(
         worst[2] = max(worst[2], weights[2] * abs(early), weights[2] * abs(late))
 
 
-@compiled()
+@compiled(allocates=True)
 def _measure_tool(
     problem: PathProblem, time: float, now: Array, then: Array, arms: Array, step: float, whole: bool, worst: Array
 ) -> None:
@@ -362,7 +362,7 @@ def _measure_tool(
         _measure_rates(arms[0], arms[1], i, step, whole, worst[1 + i])
 
 
-@compiled()
+@compiled(allocates=True)
 def _sample_path(
     problem: PathProblem, times: Array, until: float, step: float, near: Array, worst: Array
 ) -> tuple[float, float]:
@@ -404,7 +404,7 @@ def _sample_path(
     return before, math.nan
 
 
-@compiled()
+@compiled(allocates=True)
 def _measure_jump(problem: PathProblem, edge: float, time: float, step: float, near: Array, worst: Array) -> None:
     """Update the jerk in `worst` at an end of the path, `edge`, at which the acceleration is not 0.
 
@@ -426,7 +426,8 @@ def _measure_jump(problem: PathProblem, edge: float, time: float, step: float, n
 
 @compiled(
     f"f8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[:, ::1], f8[::1], f8[:, :, ::1], "
-    "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])"
+    "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])",
+    allocates=True,
 )
 def survey(
     legs: Array,

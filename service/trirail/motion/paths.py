@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trirail.kinematics.algebra import copy_vector
 from trirail.kinematics.arrays import Array, Vector
 from trirail.kinematics.closed_forward import LEGS_TYPE, forward_motion
 from trirail.kinematics.compiled import compiled
@@ -242,7 +243,7 @@ def platform_at_each(
         code = platform_at(legs, knots, pieces, in_sliders, tools, (times[k], 1.0, 0.0), near, out[k])
         if code != 0:
             return code
-        near[:] = out[k, 0]
+        copy_vector(out[k, 0], near)
     return 0
 
 

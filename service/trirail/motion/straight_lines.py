@@ -95,7 +95,7 @@ def _peak_velocity(states: Array, step: float) -> float:
     return float(np.abs(v + a * turn + j * turn**2 / 2.0).max())
 
 
-@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], b1, f8[::1], f8[::1], f8[:, :, ::1])")
+@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], b1, f8[::1], f8[::1], f8[:, :, ::1])", allocates=True)
 def _sample_line(
     legs: Array, begin: Array, length: Array, in_sliders: bool, tool: Array, near: Array, out: Array
 ) -> int:

@@ -129,7 +129,7 @@ def _rate_of_coordinate(q: Array, order: int, v: float, a: float, j: float, by: 
     return value
 
 
-@compiled()
+@compiled(allocates=True)
 def _add_derivatives(out: Derivatives, k: int, chain: Array, slope: Array, curvature: Array) -> None:
     """Convert derivatives with respect to sigma, v, a, j by the chain rule, and add them to `out`.
 
@@ -167,7 +167,7 @@ def _add_derivatives(out: Derivatives, k: int, chain: Array, slope: Array, curva
                 out.by_time[1] += second
 
 
-@compiled()
+@compiled(allocates=True)
 def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives) -> float:
     """Return the value of the barrier and write its derivatives.
 
@@ -247,7 +247,7 @@ def _substitute(band: Array, x: Array) -> None:
         x[row] /= band[row, 0]
 
 
-@compiled()
+@compiled(allocates=True)
 def _newton_step(at: Derivatives, mu: float, step: Array) -> tuple[float, float]:
     """Write the Newton step of the coefficients. Return the step of ln h, and the predicted gain.
 
@@ -271,7 +271,7 @@ def _newton_step(at: Derivatives, mu: float, step: Array) -> tuple[float, float]
     return of_time, gain
 
 
-@compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)")
+@compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)", allocates=True)
 def minimise_time(samples: Array, limits: Array, c: Array, h: float) -> float:
     """Minimise the duration of a law within limits.
 
@@ -319,7 +319,7 @@ def minimise_time(samples: Array, limits: Array, c: Array, h: float) -> float:
     return math.exp(log_h)
 
 
-@compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)")
+@compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)", allocates=True)
 def limit_excess(samples: Array, limits: Array, c: Array, h: float) -> float:
     """Return the factor by which a law must be slowed to fit the limits; see minimise_time for the parameters."""
     q, by, weights, most = np.empty((len(limits), 4)), np.empty(4), np.empty((4, COEFFICIENTS_PER_INTERVAL)), 0.0
@@ -335,7 +335,7 @@ def limit_excess(samples: Array, limits: Array, c: Array, h: float) -> float:
     return most
 
 
-@compiled("void(f8[::1], f8, f8[:, ::1])")
+@compiled("void(f8[::1], f8, f8[:, ::1])", allocates=True)
 def spline_states(c: Array, h: float, out: Array) -> None:
     """Fill `out` (n, 4) with sigma, v, a and j of the spline with coefficients `c` at the start of each interval."""
     weights = np.empty((4, COEFFICIENTS_PER_INTERVAL))

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from trirail_drivers.driver.cyclic import MOST_FRAMES
 
 from trirail.control import cycle, outputs
+from trirail.kinematics.algebra import copy_vector
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.motion.paths import law_at
@@ -411,10 +412,10 @@ def record(state: NDArray[np.void], robot: RobotArrays, batch: NDArray[np.uint8]
     s, row = state[0], robot.record[0]
     s.cycle += 1
     row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
-    row.parts_ns[:] = s.parts_ns
+    copy_vector(s.parts_ns, row.parts_ns)
     s.parts_ns[Part.DECIDE] = 0
     row.mode = s.mode
-    batch[s.batched] = robot.packed
+    copy_vector(robot.packed, batch[s.batched])
     s.batched += 1
     return int(s.cycle)
 
