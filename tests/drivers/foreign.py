@@ -19,6 +19,7 @@ from canopen.objectdictionary import ODRecord, ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 from edsfiles import rows
 from rigs import Clock
+from trirail_drivers.simulated.sdo_queue import SdoQueue
 
 Key = tuple[int, int]
 
@@ -165,6 +166,7 @@ class ForeignDrive:
         vars(self.local.nmt).update(start_heartbeat=lambda _ms: None, stop_heartbeat=lambda: None)
         self.local.add_write_callback(self._written)  # type: ignore[no-untyped-call]
         self.local.associate_network(self.network)
+        self.sdo_requests = SdoQueue(self._serve)
         self.servo = Servo(start)
         self.nmt = PRE_OPERATIONAL
         self.state = DISABLED
@@ -287,8 +289,7 @@ class ForeignDrive:
             self._nmt(data[0])
         elif identifier == 0x600 + self.node:
             if self.nmt in (OPERATIONAL, PRE_OPERATIONAL):
-                self._feedback()
-                self.local.sdo.on_request(identifier, bytearray(data), 0.0)  # type: ignore[no-untyped-call]
+                self.sdo_requests.receive(data, self.clock())
         elif identifier == 0x700 + (self.value(0x1016, 1) >> 16 & 0x7F or 0xFF):
             self._consumer_heard = self.clock()
         elif identifier == 0x80:
@@ -297,6 +298,10 @@ class ForeignDrive:
             self._sync()
         elif self.nmt == OPERATIONAL:
             self._rpdo(identifier, data)
+
+    def _serve(self, request: bytes) -> None:
+        self._feedback()
+        self.local.sdo.on_request(0x600 + self.node, bytearray(request), 0.0)  # type: ignore[no-untyped-call]
 
     def _send(self, identifier: int, data: bytes) -> None:
         self.bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
@@ -310,6 +315,8 @@ class ForeignDrive:
     def leave(self, state: int) -> None:
         """Go into another NMT state; CiA 402-2: 6007h says what the axis does that was operational."""
         was, self.nmt = self.nmt, state
+        if state == STOPPED:
+            self.sdo_requests.clear()
         if was == OPERATIONAL != state and self.has(0x6007):
             self._connection_lost()
 
@@ -332,6 +339,7 @@ class ForeignDrive:
         self._mapped_now.clear()
         self.nmt, self.state, self.mode, self.error = PRE_OPERATIONAL, DISABLED, 0, 0
         self._consumer_heard = None
+        self.sdo_requests.clear()
         self._send(0x700 + self.node, b"\x00")
 
     def _pdos(self, base: int) -> list[int]:
@@ -408,6 +416,7 @@ class ForeignDrive:
 
     def _time(self) -> None:
         now = self.clock()
+        self.sdo_requests.poll(now)
         if self.state in (QUICK_STOP, REACTION):
             self._move()
         self._feedback()

@@ -15,6 +15,7 @@ from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, Obje
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.errorcontrol import ErrorControl
 from trirail_drivers.simulated.pdo import ReceivePdo, TransmitPdo
+from trirail_drivers.simulated.sdo_queue import SdoQueue
 from trirail_drivers.simulated.sdo_server import SdoServer
 
 CONNECTION_LOST = 0x8100
@@ -75,6 +76,7 @@ class Device:
         self._emergency_id = self.objects.internal(0x1014, 0, 0x80 + node)
         self.errors = Emergencies(self.objects, self._send_emergency)
         self._sdo = SdoServer(self.objects, partial(self._send, 0x580 + node))
+        self.sdo_requests = SdoQueue(self._sdo.request)
         self._rpdos = [ReceivePdo(self.objects, 0x1400 + n, 0x1600 + n, self._route) for n in self._pdos(0x1400)]
         self._tpdos = [TransmitPdo(self.objects, 0x1800 + n, 0x1A00 + n, self._route) for n in self._pdos(0x1800)]
         self._sync_rpdos: list[ReceivePdo] = []
@@ -151,6 +153,8 @@ class Device:
         if self._error_control.poll(now):
             self._send(0x700 + self.node, bytes([self.nmt]))
         self.time_passed(now)
+        if self.sdo_requests.poll(now):
+            self._up_to_date = False
         if self._event_tpdos:
             self._send_events()
 
@@ -213,8 +217,10 @@ class Device:
             return
         if self.nmt is Nmt.OPERATIONAL:
             self.connection_lost(CONNECTION_LOST)
-        self.nmt = state
+        was, self.nmt = self.nmt, state
         self._sdo.reset()
+        if state is Nmt.STOPPED or was is Nmt.INITIALISING:
+            self.sdo_requests.clear()
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.reset()
         self._route()
@@ -230,12 +236,15 @@ class Device:
         if self._error_control.watched is not None:
             handlers[0x700 + self._error_control.watched] = self._heartbeat
         if self.nmt is not Nmt.STOPPED:
-            handlers[0x600 + self.node] = self._sdo.request
+            handlers[0x600 + self.node] = self._sdo_request
             handlers[self._sync_id.value & _CAN_ID] = self._sync
         self._sync_rpdos = [pdo for pdo in rpdos if pdo.synchronous]
         self._sync_tpdos = [pdo for pdo in tpdos if pdo.synchronous]
         self._event_tpdos = [pdo for pdo in tpdos if not pdo.synchronous]
         self._handlers = handlers
+
+    def _sdo_request(self, data: bytes) -> None:
+        self.sdo_requests.receive(data, self._now)
 
     def _heartbeat(self, _data: bytes) -> None:
         self._error_control.on_heartbeat(self._now)
