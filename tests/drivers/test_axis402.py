@@ -213,24 +213,24 @@ def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -
         axis.on_heartbeat(OPERATIONAL, T)
     else:
         axis.on_position(canopen_frames.POSITION.pack(0), T)
-    assert not axis.pdo_silent
+    assert not axis.status_wanted
     axis.on_heartbeat(PRE_OPERATIONAL, T)
     assert axis.find_fault(T, WANTED) == ("B", "state", 0, "drive B: has left NMT operational and is pre-operational")
     assert state_of(axis) is P.SWITCHED_ON  # as far as is known, it still has power
-    assert axis.pdo_silent
+    assert axis.status_wanted
     assert axis.left_operational
     axis.on_heartbeat(OPERATIONAL, T)
-    assert not axis.pdo_silent  # somebody else has started it: its statuswords come by themselves
+    assert not axis.status_wanted  # somebody else has started it: its statuswords come by themselves
     axis.clear_faults(T + 5.0)
     assert axis.find_fault(T + 5.0, OFF) is not None  # until its set-up has been checked: it may have restarted
     axis.rejoin(axis.exchange, axis.units, T + 5.0, homed=True)
     axis.clear_faults(T + 5.0)
     axis.on_heartbeat(PRE_OPERATIONAL, T + 5.0)  # sent before it was started
     assert axis.configured
-    assert not axis.pdo_silent
+    assert not axis.status_wanted
     assert axis.find_fault(T + 5.299, OFF) is None  # its statuswords have time anew
     axis.on_heartbeat(OPERATIONAL, T + 5.0)
-    assert not axis.pdo_silent
+    assert not axis.status_wanted
 
 
 @pytest.mark.parametrize("state", P)

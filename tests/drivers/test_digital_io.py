@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import random
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import groupby
 
 import can
@@ -365,26 +364,6 @@ def test_outputs_that_no_pdo_takes_go_by_sdo_and_not_on_a_path(rig: Rig) -> None
     rig.cycles(3)
     assert by_sdo(rig, 0)[-1] == VALVE | LAMP
     assert rig.devices[0].pins.bits == VALVE | LAMP
-
-
-def test_no_poll_follows_an_output_by_sdo_before_a_slow_drive_has_taken_it(rig: Rig) -> None:
-    """It has room for one request: a poll that comes before its answer would take the place of the output."""
-    unmappable(rig)
-    rig.ready()
-    axis, word = rig.drives._axes[0], 0
-    axis.exchange = replace(axis.exchange, polled=True)
-    period = round(canopen_frames.POLL_PERIOD / STEP)
-    for phase in range(period):
-        rig.cycles(100 + phase)
-        rig.bus.sent.clear()
-        word ^= VALVE
-        rig.drives.set_outputs((word, 0, 0))
-        rig.cycles(period - 1)
-        asked = [data[1:3] for data in rig.sent_to(canopen_frames.SDO_REQUEST)[0]]
-        assert asked[-1] == b"\xfe\x60"
-        assert rig.devices[0].pins.bits == word
-    rig.cycles(2 * period)
-    assert rig.sent_to(canopen_frames.SDO_REQUEST)[0][-1][1:3] == b"\x41\x60", "polls go on"
 
 
 def test_compiled_cycles_wait_for_outputs_by_sdo(rig: Rig) -> None:

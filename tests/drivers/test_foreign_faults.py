@@ -11,6 +11,7 @@ from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, QUI
 from drivers.test_foreign import MAKES, PERIOD, Rig
 from msgspec import structs
 from rigs import OFF, Closing, frame
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.codes import describe_error
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Homing
@@ -436,7 +437,8 @@ def test_homing_waits_for_the_answer_to_a_poll(closing: Closing, phase: int) -> 
     )
     vars(a).update(pump=pumped)
     rig.cycles(20 + phase // 2, rig.target)
-    rig.drives._axes[0].unanswered += phase == 0  # an answer was lost
+    if phase == 0:  # an answer was lost
+        rig.drives._axes[0].note_request(rig.clock.now, canopen_frames.STATUSWORD_UPLOAD)
     rig.drives.home()
     feedback = rig.cycles(300, rig.target)
     assert feedback.fault is None

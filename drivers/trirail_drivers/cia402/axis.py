@@ -8,6 +8,7 @@ from typing import Any
 from trirail_drivers.cia402 import canopen_frames, process_data
 from trirail_drivers.cia402.codes import describe_error
 from trirail_drivers.cia402.duplicate_node import AnswersAfterStop
+from trirail_drivers.cia402.pending_request import PendingRequest
 from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import DigitalIo, Drives
@@ -40,6 +41,7 @@ RESET_TIME = 2 * canopen_frames.STATUS_PERIOD
 
 _RESTARTED = "has restarted and lost its set-up: wait until the drive is configured again, then send reset"
 _NMT_STATES = {canopen_frames.STOPPED: "stopped", canopen_frames.PRE_OPERATIONAL: "pre-operational"}
+_POLLS = (canopen_frames.STATUSWORD_UPLOAD, canopen_frames.MODE_DISPLAY_UPLOAD)
 _STATE_BITS = 0x6F
 """Bits of a statusword that encode the state."""
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
@@ -92,18 +94,17 @@ class Cia402Axis(Axis):
         """Last error code that the drive reported; 0 once it has reported the end of the error."""
         self.reset_until = -math.inf
         """Time until which a fault reset may take effect [s]."""
-        self.pdo_silent = False
-        """Whether the last heartbeat showed a state without PDOs, so that the statusword must be requested."""
+        self.status_wanted = False
+        """Whether the statusword must be requested by SDO: the last heartbeat showed a state without PDOs, or a
+        controlword has been sent by SDO.
+        """
         self.left_operational = False
         """Whether the drive has left NMT operational, and its set-up has not been checked since then."""
         self.sdo_asked: bytes | None = None
         """Index of the object whose SDO answer is pending, little-endian."""
-        self.unanswered = 0
-        """Number of unanswered SDO requests."""
-        self.answered_by = self.unanswered_since = -math.inf
-        """Time by which the drive must have answered the newest SDO request, and time since when requests have been
-        unanswered without a break [s].
-        """
+        self._pending = PendingRequest()
+        self.word_by_sdo: int | None = None
+        """Controlword sent last by SDO; None if the drive may have lost it, or has since been sent another by PDO."""
         self.poll_due = self._register_until = -math.inf
         """Time of the next statusword request, and time until which the error register may arrive [s]."""
         self.register_wanted = False
@@ -140,7 +141,7 @@ class Cia402Axis(Axis):
     def forget_power_state(self) -> None:
         """Forget the last power state, and stop looking for positions of another node, since a new set-up begins."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
-        self.unanswered = 0
+        self.forget_requests()
         self._statusword_asked = self._overtaken = False
         self._answers_after.forget()
 
@@ -148,22 +149,34 @@ class Cia402Axis(Axis):
         """Record an SDO request."""
         if request == canopen_frames.STATUSWORD_UPLOAD:
             self._statusword_asked, self._overtaken = True, False
-        if not self.unanswered:
-            self.unanswered_since = now
-        self.unanswered += 1
-        self.answered_by = now + ANSWER_TIME
+        if self.unanswered:  # the drive may lose the earlier request
+            self.word_by_sdo, self.outputs_sent = None, NOTHING_SENT
+        supervises = request in _POLLS and not self.left_operational  # one lost answer must not become a fault
+        self._pending.begin(now, request, canopen_frames.STATUS_PERIOD if supervises else ANSWER_TIME)
 
-    def forget_lost_requests(self, now: float) -> bool:
-        """Whether SDO requests or their answers have been lost until time `now` [s]; if so, stop waiting for them."""
-        lost = self.unanswered > 0 and now >= self.unanswered_since + ANSWER_TIME
-        if lost:
-            self.unanswered = 0
-        return lost
+    @property
+    def unanswered(self) -> bool:
+        """Whether the newest SDO request has not been answered yet."""
+        return self._pending.unanswered
+
+    def accepts_request(self, now: float) -> bool:
+        """Whether an SDO request may be sent at time `now` [s], since a server handles one at a time (CiA 301).
+
+        A request that has been unanswered for too long is lost.
+        """
+        if self._pending.is_lost(now):
+            self.forget_requests()
+        return not self.unanswered
+
+    def forget_requests(self) -> None:
+        """Await no answer, and send again what the drive may have lost."""
+        self._pending.forget()
+        self.word_by_sdo, self.outputs_sent = None, NOTHING_SENT
 
     def rejoin(self, exchange: process_data.Exchange, units: Units, now: float, *, homed: bool) -> None:
         """Let the drive take part in the cycle again after a set-up in the background."""
         self.set_up(exchange, units)
-        self.restarted = self.silent = self.left_operational = self.pdo_silent = False
+        self.restarted = self.silent = self.left_operational = self.status_wanted = False
         self.stopped = self._operational = False
         self.powered_up = self.has_followed = self._followed = self.has_setpoint = False
         self.mode.shown, self.cyclic, self.follows, self.held, self.mode_bits = exchange.mode_shown, True, True, None, 0
@@ -182,6 +195,7 @@ class Cia402Axis(Axis):
         If `stopping` is False, the drive is assumed to have no power.
         """
         self.silent = True
+        self.forget_requests()
         if not stopping:
             self.forget_power_state()
 
@@ -209,7 +223,7 @@ class Cia402Axis(Axis):
         settled = self.state is wanted and wanted is not PowerState.QUICK_STOP_ACTIVE
         no_fault = self.event is None and not self.error_code and self.reset_until == -math.inf
         lives = self._operational and not (
-            self.stopped or self.left_operational or self.pdo_silent or self.register_wanted
+            self.stopped or self.left_operational or self.status_wanted or self.register_wanted
         )
         asked = self.sdo_asked is not None or self.exchange.polled or self.awaits_mode
         follows = wanted is PowerState.OPERATION_ENABLED and self.exchange.tells_following
@@ -258,15 +272,18 @@ class Cia402Axis(Axis):
             return
         if self.setup_listener is not None:
             self.setup_listener(canopen_frames.SDO_ANSWER + self.node, data)
-        self.unanswered = max(0, self.unanswered - 1)
+        if self._pending.end(data):
+            self.forget_requests()
         if data[1:3] == self.sdo_asked:
             self.sdo_answer, self.sdo_asked = bytes(data), None
         if canopen_frames.is_upload(data, canopen_frames.MODE_DISPLAY_UPLOADED) and self.awaits_mode:
             self._update_mode(data[4])
+            self.poll_due = now + canopen_frames.POLL_PERIOD
         elif canopen_frames.is_upload(data, canopen_frames.STATUSWORD_UPLOADED):
             if not self._overtaken:
                 self._on_statusword(data[4:6], now)
             self._statusword_asked = self._overtaken = False
+            self.poll_due = now + canopen_frames.POLL_PERIOD
         elif data[:4] == canopen_frames.OUTPUTS_REFUSED:
             code = int.from_bytes(data[4:8], "little")
             self.note_fault("state", 0, f"refuses its digital outputs, object 60FE:01 (SDO abort {code:08X})")
@@ -288,7 +305,7 @@ class Cia402Axis(Axis):
 
     def request(self) -> bytes:
         """Return the next SDO request: for the statusword, for the mode display, or for both in turn."""
-        both = self.exchange.polled or self.pdo_silent
+        both = self.exchange.polled or self.status_wanted
         for_mode = self.awaits_mode and self.mode.is_next(alone=not both)
         return canopen_frames.MODE_DISPLAY_UPLOAD if for_mode else canopen_frames.STATUSWORD_UPLOAD
 
@@ -361,7 +378,7 @@ class Cia402Axis(Axis):
         if self._answers_per_sync.from_two_nodes():
             self.note_fault("frame", 0, warning(self.node, "each SYNC has two positions"))
         if mistaken is not None:
-            self.left_operational = self.pdo_silent = False
+            self.left_operational = self.status_wanted = False
             by = "one node has booted, or is not operational, while the other sends positions"
             self.event = self.make_fault("frame", 0, warning(self.node, by))
         return mistaken
@@ -409,11 +426,14 @@ class Cia402Axis(Axis):
         if self.exchange.heard:
             self.heard = now
         self.stopped = state == canopen_frames.STOPPED
+        if self.stopped:
+            self.forget_requests()  # in NMT stopped, a node answers no SDO (CiA 301)
         if state == canopen_frames.OPERATIONAL:
             self._operational = True
         elif state == canopen_frames.BOOT_UP:
             was_there = self.configured and self.missed < MISSED_STATUSES
-            self.restarted, self.boots, self.unanswered = True, self.boots + 1, 0
+            self.restarted, self.boots = True, self.boots + 1
+            self.forget_requests()
             self.left_operational = self._operational = False
             self.state = PowerState.NOT_READY_TO_SWITCH_ON
             # This replaces an earlier event, which the restart explains.
@@ -424,7 +444,7 @@ class Cia402Axis(Axis):
             self.leave_operational()
             self.note_fault("state", 0, f"has left NMT operational and is {_NMT_STATES.get(state, f'in {state:02X}')}")
             self._answers_after.begin(self.event)
-        self.pdo_silent = self.left_operational and not self.silent and state != canopen_frames.OPERATIONAL
+        self.status_wanted = self.left_operational and not self.silent and state != canopen_frames.OPERATIONAL
 
     def leave_operational(self) -> None:
         """Record that the drive no longer receives PDOs.

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Final
 
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import Key, title
-from trirail_drivers.cia402.sdo import SdoRefused, shown
+from trirail_drivers.cia402.sdo import Remote, SdoRefused, shown
 from trirail_drivers.config import DigitalIo
 from trirail_drivers.errors import DriveError
 
 INPUTS: Final[Key] = 0x60FD, 0
 OUTPUTS: Final[Key] = 0x60FE, 1
 MASK: Final[Key] = 0x60FE, 2
+
+
+async def make_outputs_safe(remote: Remote, io: DigitalIo) -> None:
+    """Write the safe values of the outputs, beside the present values of the other bits.
+
+    A refusal is ignored, since the set-up configures the outputs later.
+    """
+    if io.outputs:
+        others = (await remote.peek(*OUTPUTS) or 0) & ~io.outputs
+        with suppress(SdoRefused):
+            await remote.write(*OUTPUTS, others | io.safe)
 
 
 async def configure_outputs(drive: Differences, io: DigitalIo) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import can
@@ -258,17 +258,11 @@ class Cia402(Driver[Cia402Axis]):
         self._wire.receive(now)
         for axis in self._axes:
             axis.update_inputs()
-        self._ask_for_statuswords(self._axes)
-        return self._feedback()
-
-    def _ask_for_statuswords(self, axes: Iterable[Cia402Axis]) -> None:
-        """Request statuswords by SDO, as neither an EMCY nor an NMT state shows whether a drive has power."""
         now = self._clock()
-        for axis in axes:
-            if now >= axis.poll_due:
-                self._enable_sdo(axis)
+        for axis in self._axes:  # neither an EMCY nor an NMT state shows whether a drive has power
+            if now >= axis.poll_due and axis.accepts_request(now):
                 self._ask(axis, canopen_frames.STATUSWORD_UPLOAD)
-                axis.poll_due = now + canopen_frames.POLL_PERIOD
+        return self._feedback()
 
     def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
         a, b, c = self._axes
@@ -337,7 +331,7 @@ class Cia402(Driver[Cia402Axis]):
         for number, axis in enumerate(self._axes):
             by_pdo = axis.maps_outputs and not axis.left_operational
             silent = axis.missed >= self._drives.missed_positions
-            if silent if by_pdo else axis.forget_lost_requests(now):
+            if by_pdo and silent:
                 axis.outputs_sent = NOTHING_SENT
             if not (outputs_pending(axis) and axis.present):
                 continue
@@ -345,13 +339,10 @@ class Cia402(Driver[Cia402Axis]):
                 put_outputs(axis, self.tables.outputs.frames[number, DATA_AT:])
                 if self._wire.send(self.tables.outputs.frame(number)) and not silent:
                     note_outputs(axis)
-            elif axis.unanswered or self._is_being_configured(axis):  # a server handles one request at a time (CiA 301)
-                continue
-            else:
+            elif axis.accepts_request(now) and not self._is_being_configured(axis):
                 word = canopen_frames.OUTPUTS.pack(axis.outputs | axis.outputs_kept)
                 if self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + word):
                     axis.outputs_sent, axis.outputs_repeats = axis.outputs, 0
-                axis.poll_due = now + canopen_frames.POLL_PERIOD  # another request could overwrite this one
 
     def _make_outputs_safe(self) -> None:
         """Write the safe values of the outputs and wait for the answers.
@@ -363,7 +354,7 @@ class Cia402(Driver[Cia402Axis]):
         self._await_answers(asked)  # a server handles one request at a time (CiA 301)
         for axis in asked:
             word = canopen_frames.OUTPUTS.pack(axis.outputs | axis.outputs_kept)
-            axis.unanswered = 0
+            axis.forget_requests()
             self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + word)
         self._await_answers(asked)
 
@@ -466,8 +457,9 @@ class Cia402(Driver[Cia402Axis]):
             self._command()
 
     def _ask_for_registers(self) -> None:
+        now = self._clock()
         for axis in self._axes:
-            if axis.register_wanted:
+            if axis.register_wanted and axis.accepts_request(now) and not self._is_being_configured(axis):
                 axis.register_wanted = False
                 self._ask(axis, canopen_frames.ERROR_REGISTER_UPLOAD)
 
@@ -482,12 +474,11 @@ class Cia402(Driver[Cia402Axis]):
     def _poll(self, now: float) -> None:
         """Request the values that no PDO contains by SDO, one request at a time for each drive, without waiting."""
         for axis in self._axes:
-            if axis.sdo_asked is not None or self._is_being_configured(axis):
+            if axis.sdo_asked is not None or self._is_being_configured(axis) or not axis.accepts_request(now):
                 continue
-            if axis.pdo_silent or ((axis.exchange.polled or axis.awaits_mode) and now >= axis.poll_due):
+            if axis.status_wanted or ((axis.exchange.polled or axis.awaits_mode) and now >= axis.poll_due):
                 self._ask(axis, axis.request())
-                axis.pdo_silent = False
-                axis.poll_due = now + canopen_frames.POLL_PERIOD
+                axis.status_wanted = False
 
     def _command(self) -> None:
         """Send the controlwords that are due, one transition per drive at a time."""
@@ -499,12 +490,17 @@ class Cia402(Driver[Cia402Axis]):
             word = axis.word(now, wanted)
             deaf = axis.may_miss_pdos and _target_of(axis, self._wanted) is not PowerState.OPERATION_ENABLED
             repeat = axis.command_age >= REPEAT_AFTER and (deaf or axis.is_not_followed(word, wanted))
-            if not (word != axis.controlword or repeat):
+            # PDOs are received only in NMT operational (CiA 301), so stop commands are sent by PDO and SDO. A new one
+            # is sent by SDO immediately, also before an answer. Later, it takes turns with requests for the statusword.
+            free = axis.accepts_request(now)
+            urgent = deaf and word not in (axis.word_by_sdo, canopen_frames.FAULT_RESET)
+            if not (word != axis.controlword or repeat or urgent):
                 continue
-            if deaf:
-                # PDOs are received only in NMT operational (CiA 301), so stop commands are sent by PDO and SDO.
+            if urgent or (deaf and free and not axis.status_wanted and now >= axis.poll_due):
                 self._send_word_by_sdo(axis, word)
             if self._send_word(axis, word):
+                if word != axis.controlword and not deaf:
+                    axis.word_by_sdo = None
                 axis.word_repeats = axis.word_repeats + 1 if word == axis.controlword else 0
                 axis.controlword = word
                 axis.command_age = 0
@@ -522,17 +518,17 @@ class Cia402(Driver[Cia402Axis]):
 
     def _send_word_by_sdo(self, axis: Cia402Axis, word: int) -> None:
         """Send a controlword by SDO, which also works in NMT pre-operational."""
-        self._enable_sdo(axis)
         data = canopen_frames.CONTROLWORD_DOWNLOAD + canopen_frames.CONTROLWORD.pack(word) + bytes(2)
-        self._ask(axis, data)
-
-    def _enable_sdo(self, axis: Cia402Axis) -> None:
-        """Switch a node in NMT stopped, in which it receives no SDO, to pre-operational."""
-        if axis.stopped:
-            self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
+        if self._ask(axis, data):
+            axis.word_by_sdo, axis.status_wanted = word, True
 
     def _ask(self, axis: Cia402Axis, request: bytes) -> bool:
-        """Send an SDO request; return whether the bus accepted it."""
+        """Send an SDO request; return whether the bus accepted it.
+
+        A node in NMT stopped, in which it receives no SDO, is first switched to pre-operational.
+        """
+        if axis.stopped:
+            self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
         sent = self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, request))
         if sent:
             axis.note_request(self._clock(), request)
@@ -557,7 +553,7 @@ class Cia402(Driver[Cia402Axis]):
 
     def _continue_stop(self) -> None:
         self._command()
-        self._ask_for_statuswords(axis for axis in self._axes if axis.left_operational and not axis.unanswered)
+        self._poll(self._clock())
 
     @staticmethod
     def _describe_protection(protection: str) -> str:

@@ -233,7 +233,7 @@ class HomingSequence:
 
         An SDO server handles one request at a time (CiA 301), so an earlier request of the cycle is answered first.
         """
-        while axis.unanswered and not axis.forget_lost_requests(self._now):
+        while not axis.accepts_request(self._now):
             yield
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
         request = _SDO.pack(command, index, 0, bytes([value]))

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Difference, Differences
-from trirail_drivers.cia402.digital_io import check_inputs, configure_outputs
+from trirail_drivers.cia402.digital_io import check_inputs, configure_outputs, make_outputs_safe
 from trirail_drivers.cia402.drive_units import Scaling, check_polarity, read_scaling, read_units
 from trirail_drivers.cia402.dry_run import DryRun
 from trirail_drivers.cia402.guarding import configure_watchdogs
@@ -114,18 +114,24 @@ class SetupTask(NamedTuple):
     """Whether the setpoints contain the velocity offset if the drive has it."""
     travel: tuple[float, float] | None = None
     """Travel of the slider [m]; None if the drive's position limits are not checked."""
-    check: Callable[[Identity, Scaling], None] | None = None
-    """Function that raises DriveError for a returning drive that is not as it was."""
+    check: Callable[[Identity, Scaling | None], None] | None = None
+    """Function that raises DriveError for a returning drive that is not as it was; None for a drive that is set up for
+    the first time. The scaling is None if it has not been read yet.
+    """
 
 
 async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
     """Wait for a drive, remove its power, and do a dry run of its whole set-up.
 
-    With `read_only`, its power is not changed either, and the drive is asked which objects may be written.
+    The outputs of a returning drive get their safe values before the dry run, which takes many requests. With
+    `read_only`, its power and outputs are not changed either, and the drive is asked which objects may be written.
     """
     await wait_for_drive(one.remote, one.drive.node, to_pre_operational=not read_only)
     dry_run = DryRun(one.remote, read_only=read_only)
     await _switch_off(dry_run if read_only else one.remote, one.drives.stop_timeout)
+    if one.check is not None and not read_only:  # its outputs may still be on
+        one.check(await _read_identity(one.remote), None)
+        await make_outputs_safe(one.remote, one.io)
     made = await configure_drive(one, dry_run)
     await read_start(dry_run, one.io)
     return made

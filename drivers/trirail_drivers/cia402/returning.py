@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine, Sequence
+from functools import partial
 from typing import Any, Final
 
 from trirail_drivers.bus.frames import FrameSender
@@ -54,7 +55,8 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         client = Client(sender, before.node, before.od, before.timeout, clock)
         remote = Remote(self.axis.name, client)
         remote.logs = False
-        one = self.one._replace(remote=remote, check=self._check_same)
+        check = None if self.setup is None else partial(self._check_same, self.setup)
+        one = self.one._replace(remote=remote, check=check)
         return configure_one(one, self._fastest, self._check_identifiers), client
 
     def record_setup(self, made: SetUp, answered: int) -> None:
@@ -74,6 +76,12 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
             f"drive {self.axis.name}: object 607C:00 (home offset) is {made.home_offset}, was "
             f"{self.setup.home_offset}: home it, or restore the offset and restart the service"
         )
+
+    def interrupt(self) -> None:
+        """Abandon the conversation. The cycle waits for the answer to its last request."""
+        if isinstance(self.client, Client) and self.client.asked is not None:
+            self.axis.note_request(self.client.clock(), self.client.asked)
+        super().interrupt()
 
     def may_have_power(self, *, stopping: bool) -> bool:
         """Whether the statusword shows power, or the drive is silent while drives are `stopping`."""
@@ -98,17 +106,16 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
 
         The set-up must wait for this, since an SDO server handles one request at a time (CiA 301).
         """
-        return not self.axis.unanswered or now >= self.axis.answered_by
+        return self.axis.accepts_request(now)
 
-    def _check_same(self, now: Identity, scaling: Scaling) -> None:
+    def _check_same(self, last: SetUp, now: Identity, scaling: Scaling | None) -> None:
         """Raise DriveError if the drive is not the previous one, or would move in another direction or scale."""
-        if self.setup is None:
-            return
-        name, allowed, before = self.axis.name, self.one.drive.allow_replacement, self.setup.identity
+        name, allowed, before = self.axis.name, self.one.drive.allow_replacement, last.identity
         numbers = {words: (getattr(before, field), getattr(now, field)) for field, words in _NUMBERS.items()}
         may_differ = [_NUMBERS[field] for field in _MAY_DIFFER]
         replaced = replacement_refusal(name, numbers, may_differ, allowed=allowed)
-        if text := replaced or lost_settings(name, self.setup.scaling, scaling):
+        lost = "" if scaling is None else lost_settings(name, last.scaling, scaling)
+        if text := replaced or lost:
             raise DriveError(text)
 
     def _check_identifiers(self, looked: SetUp) -> None:

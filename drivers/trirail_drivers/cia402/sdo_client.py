@@ -74,7 +74,8 @@ class Client:
         """Whether the drive has sent a boot-up message that no request has reported yet."""
         self.is_stopped = False
         """Whether the newest heartbeat received while waiting shows NMT stopped, in which a node answers no request."""
-        self._asked: bytes | None = None
+        self.asked: bytes | None = None
+        """Request whose answer is awaited."""
         self._last = bytes(8)
         self._again = 0
         self._knows_no_segments = False
@@ -158,10 +159,10 @@ class Client:
     async def _request(self, request: bytes, key: Key | None = None) -> bytes:
         """Send a request, and return the answer. `key` is the object of a segment, which does not contain it."""
         self._check_booted()
-        self._asked = request
+        self.asked = request
         self._send(request)
         frame = await Wait(self._is_awaited, self.clock() + self.timeout)
-        self._asked, self._last = None, request
+        self.asked, self._last = None, request
         if self._again >= MAX_SECOND_ANSWERS:
             raise TwoNodesError(self.node)
         if frame is None:
@@ -198,16 +199,16 @@ class Client:
         A single second answer may be a late answer, but MAX_SECOND_ANSWERS of them prove that there are two servers.
         """
         if self._is_boot_up(message):
-            return self._asked is not None
+            return self.asked is not None
         identifier, data = can_id(message), bytes(message.data)
         if identifier == canopen_frames.HEARTBEAT + self.node and data:
             self.is_stopped = data[0] & canopen_frames.NMT_STATE_BITS == canopen_frames.STOPPED
         if identifier != canopen_frames.SDO_ANSWER + self.node:
             return False
-        if self._asked is not None and answers(self._asked, data):
+        if self.asked is not None and answers(self.asked, data):
             return True
         self._again += answers(self._last, data)
-        return self._asked is not None and self._again >= MAX_SECOND_ANSWERS
+        return self.asked is not None and self._again >= MAX_SECOND_ANSWERS
 
     def _is_boot_up(self, message: can.Message) -> bool:
         own = can_id(message) == canopen_frames.HEARTBEAT + self.node

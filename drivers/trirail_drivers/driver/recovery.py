@@ -143,6 +143,10 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
             self.conversation.close()
             self.conversation = self.client = None
 
+    def interrupt(self) -> None:
+        """Abandon a conversation whose last request the drive may still be handling."""
+        self.end()
+
     def unready(self, *, blocked: bool) -> Unready | None:
         """Return the reason why the drive cannot be reset yet. If `blocked`, it waits until no drive has power."""
         axis, name = self.axis, f"drive {self.axis.name}"
@@ -209,7 +213,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
         self._stopping = stopping
         if self._blocked:
             for each in self._each:
-                each.end()
+                each.interrupt()
             return
         # The sum is bounded: otherwise steps that no drive could use would accumulate and cause a burst.
         self._steps_due = min(self._steps_due + self._steps_per_cycle, max(1.0, self._steps_per_cycle))
