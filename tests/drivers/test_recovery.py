@@ -671,9 +671,9 @@ def test_no_drive_is_asked_for_something_else_before_it_has_answered(
     def sent(message: can.Message, timeout: float | None = None) -> None:
         node = message.arbitration_id - canopen_frames.SDO_REQUEST
         if 0 < node < 0x80 and message.data[0] != 0x80:
-            thing = bytes(message.data[1:4])
+            thing = bytes(message.data)
             before, at = asked.get(node, (b"", -math.inf))
-            stops = thing == canopen_frames.CONTROLWORD_DOWNLOAD[1:4] != before
+            stops = thing != before and thing.startswith(canopen_frames.CONTROLWORD_DOWNLOAD)
             if rig.now < at + ANSWER_TIME and not stops:
                 mistaken.append(f"{rig.now:.3f} s: node {node} is asked for {thing.hex()}, not answered {before.hex()}")
             asked[node] = thing, rig.now
