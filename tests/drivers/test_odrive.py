@@ -543,8 +543,7 @@ class TestFaults:
         enabled.drives.disable()
         assert enabled.cycles(300).state == OFF
         drive, device = CONFIG.each[index], enabled.devices[index]
-        device.servo.position += 4.0 * CONFIG.following_error * drive.counts_per_metre
-        device.servo.hold()
+        device.servo.push(4.0 * CONFIG.following_error * drive.counts_per_metre)
         feedback = enabled.cycles(20)
         assert feedback.fault is None
         assert abs(feedback.position[index] - START[index]) > 3.0 * CONFIG.following_error

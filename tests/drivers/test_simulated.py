@@ -25,9 +25,9 @@ S = PowerState
 class Rig(DeviceRig[SimulatedDrive]):
     """A CiA 402 drive (1 µm a count, 2 m/s, 100 m/s² at most)."""
 
-    def __init__(self, time_constant: float = 0.0) -> None:
+    def __init__(self, time_constant: float = 0.0, friction: float | None = None) -> None:
         self.servo = Servo(START, time_constant=time_constant, max_velocity=2e6, max_acceleration=1e8)
-        super().__init__(SimulatedDrive(NODE, self.servo))
+        super().__init__(SimulatedDrive(NODE, self.servo, friction=friction))
 
     def state(self) -> PowerState:
         return self.drive.state
@@ -815,6 +815,31 @@ def test_quick_stop_brakes_with_its_ramp_and_time_runs_on_without_sync(rig: Rig)
     assert rig.state() is S.SWITCH_ON_DISABLED
     coasted = 3 * PERIOD * 1e5  # until the SYNC was found lost
     assert rig.servo.position - began == pytest.approx(1e5**2 / (2 * DECELERATION) + coasted, rel=1e-6)
+
+
+@pytest.mark.parametrize("friction", [5e6, None])
+@pytest.mark.parametrize("why", ["command", "fault"])
+def test_without_power_friction_stops_the_axis(why: str, friction: float | None) -> None:
+    """Also after a fault whose reaction is no ramp (605Eh = 0)."""
+    rig = Rig(friction=friction)
+    rig.drive.objects[0x605E, 0].value = 0
+    rig.enable()
+    target = rig.move(1e5)
+    if why == "command":
+        rig.cycle(0x00, target)
+    else:
+        rig.drive.fail(0x2310)
+    rig.now += PERIOD
+    rig.send(0x080)
+    assert rig.state() is (S.SWITCH_ON_DISABLED if why == "command" else S.FAULT)
+    began, moving = rig.servo.position, rig.servo.velocity
+    for _ in range(100):
+        rig.now += PERIOD
+        rig.send(0x080)
+    assert rig.servo.velocity == 0.0
+    deceleration = friction or rig.servo.max_acceleration
+    assert rig.servo.position - began == pytest.approx(moving**2 / (2 * deceleration), rel=1e-6)
+    assert friction is None or rig.servo.position - began > 500
 
 
 def test_a_ramp_that_began_without_sync_does_not_hurry_when_sync_comes_back(rig: Rig) -> None:

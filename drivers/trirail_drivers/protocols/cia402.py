@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Final
 
 from trirail_drivers import config
 from trirail_drivers.cia402 import canopen_frames, checks, process_data, units
@@ -14,6 +15,9 @@ from trirail_drivers.cia402.objects import PROTECTIONS, describe_protection
 from trirail_drivers.cia402.other_masters import check_exclusive
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import EDS, Frames, Mechanics, Servo, SimulatedDevice, SimulatedDrive
+
+FRICTION: Final = 5.0
+"""Deceleration of a simulated slider without power, by friction and the brake of its drive [m/s²]."""
 
 
 def _simulated_drive(
@@ -31,7 +35,8 @@ def _simulated_drive(
     switch = None if drive.homing is None else -counts
     servo = Servo.configured(simulated, drive, counts if switch is None else 0)
     eds = Path(drive.eds) if drive.eds is not None else EDS
-    device = SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, mechanics_of(drive))
+    friction = FRICTION * drive.counts_per_metre
+    device = SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, mechanics_of(drive), friction)
     for each in drive.write if drive.eds is None else ():
         device.objects.add(each.object, each.sub, each.bits, signed=each.signed)
     return device

@@ -46,8 +46,8 @@ class SimulatedDrive(Device):
 
     With each SYNC, the axis moves by one interpolation period (60C2h). The SYNC first completes the motion since the
     previous SYNC, then the TPDOs sample the position, and then the latched setpoints are applied. Without SYNC, the
-    axis moves with time. Until the loss of SYNC is detected, the axis keeps its velocity. Without power, the brake
-    holds the axis, but a push by hand still moves it.
+    axis moves with time. Until the loss of SYNC is detected, the axis keeps its velocity. Without power, friction and
+    the brake stop the axis and hold it, but a push by hand still moves it.
     """
 
     def __init__(
@@ -58,11 +58,15 @@ class SimulatedDrive(Device):
         home_switch: float | None = None,
         eds: Path = EDS,
         mechanics: Mechanics = MECHANICS,
+        friction: float | None = None,
     ) -> None:
-        """`eds` defines the objects and their units; the drive also works if objects are missing."""
+        """`eds` defines the objects and their units; the drive also works if objects are missing. `friction` is the
+        deceleration without power [counts/s²], by default the largest one of the motor.
+        """
         super().__init__(node, eds)
         self._missed_syncs = missed_syncs
         self.servo = servo
+        self._friction = servo.max_acceleration if friction is None else friction
         self.homing = HomingMode(servo, home_switch)
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self._synchronised = False
@@ -96,7 +100,8 @@ class SimulatedDrive(Device):
         self._up_to_date = False
         self.fault = self._profile.error_code.value = code
         self.errors.report(code)
-        self._change(PowerState.FAULT_REACTION_ACTIVE)
+        coasts = self._profile.coasts_in_fault
+        self._change(PowerState.FAULT if coasts else PowerState.FAULT_REACTION_ACTIVE)
 
     # Methods of Device that CiA 402 extends.
 
@@ -183,8 +188,6 @@ class SimulatedDrive(Device):
             self.homing.interrupt()
         self.state = state
         self._profile.change(enabled=state is PowerState.OPERATION_ENABLED)
-        if state not in _POWERED:
-            self.servo.hold()
         if state is PowerState.OPERATION_ENABLED:
             self._beyond_window = None
             if not self._setpoint_given:
@@ -195,9 +198,8 @@ class SimulatedDrive(Device):
 
     def _move(self, step: float, feed_forward: float) -> None:
         if self.state not in _POWERED:
-            self._profile.update_actual(self.servo)
-            return
-        if self._follows_command:
+            self.servo.roll(self._friction, step)
+        elif self._follows_command:
             self.servo.follow(self._profile.setpoint, feed_forward, step)
             self._watch_following_error(step)
         elif self._homes and self.homing.under_way:

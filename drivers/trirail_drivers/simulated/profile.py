@@ -72,13 +72,16 @@ _STOP_AND_DISABLE, _STOP_AND_STAY = 2, 6
 _STAY_OPTIONS: Final = (5, 6, 7, 8)
 """Values of 605Ah with which the drive stays in QUICK STOP ACTIVE."""
 
+_COAST, _RAMP = 0, 2
+"""Values of 605Eh: no ramp, and the quick-stop ramp. The simulated drive has no other ramp."""
+
 _WINDOW_OFF: Final = 0xFFFFFFFF
 
 
 class Profile:
     """CiA 402 objects of a drive.
 
-    Missing objects have defaults: 6007h is 0, 605Ah is 2, 6065h is off, 60B0h and 60B1h are 0.
+    Missing objects have defaults: 6007h is 0, 605Ah and 605Eh are 2, 6065h is off, 60B0h and 60B1h are 0.
     """
 
     def __init__(self, objects: Dictionary, mechanics: Mechanics, mode_changed: Callable[[], None]) -> None:
@@ -94,6 +97,7 @@ class Profile:
         self.statusword = o.internal(0x6041, 0)
         self.mode = o.internal(0x6060, 0)
         self._quick_stop_option = o.internal(0x605A, 0, _STOP_AND_DISABLE)
+        self._fault_reaction_option = o.internal(0x605E, 0, _RAMP)
         self._mode_display = o.internal(0x6061, 0)
         self._position = o.internal(0x6064, 0)
         self._window = o.internal(0x6065, 0, _WINDOW_OFF)
@@ -171,6 +175,11 @@ class Profile:
     def stays_stopped(self) -> bool:
         """Whether the drive stays in QUICK STOP ACTIVE (605Ah)."""
         return self._quick_stop_option.value in _STAY_OPTIONS
+
+    @property
+    def coasts_in_fault(self) -> bool:
+        """Whether a fault removes the power without a ramp (605Eh)."""
+        return self._fault_reaction_option.value == _COAST
 
     @property
     def window(self) -> tuple[float, float]:

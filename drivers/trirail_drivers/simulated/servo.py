@@ -88,12 +88,6 @@ class Servo:
         """Setpoint minus position [counts]."""
         return self.setpoint - self.position
 
-    def hold(self) -> None:
-        """Stop immediately, held by the brake."""
-        self.velocity = self._feed_forward = 0.0
-        self.setpoint = self.position
-        self.limited = False
-
     def follow(self, target: float, feed_forward: float, step: float) -> None:
         """Move for `step` seconds towards `target` [counts], with `feed_forward` [counts/s] at the end of the step."""
         feed_forward *= self._feed_forward_gain if self.lag is None else 0.0
