@@ -520,7 +520,9 @@ class Cia402(Driver[Cia402Axis]):
         """Send a controlword by SDO, which also works in NMT pre-operational."""
         data = canopen_frames.CONTROLWORD_DOWNLOAD + canopen_frames.CONTROLWORD.pack(word) + bytes(2)
         if self._ask(axis, data):
-            axis.word_by_sdo, axis.status_wanted = word, True
+            axis.word_by_sdo, axis.poll_due = word, self._clock() + canopen_frames.POLL_PERIOD
+            # The statusword of other drives comes by PDO.
+            axis.status_wanted = axis.status_wanted or axis.left_operational or axis.exchange.polled
 
     def _ask(self, axis: Cia402Axis, request: bytes) -> bool:
         """Send an SDO request; return whether the bus accepted it.
