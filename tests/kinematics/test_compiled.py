@@ -161,6 +161,31 @@ def test_without_a_folder_of_its_own_compiled_code_is_in_one_for_temporary_files
     )
 
 
+def test_a_user_without_a_home_gets_no_folder_in_the_working_directory(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    (room / "closure.py").write_text(
+        "from trirail.kinematics.compiled import compiled\n@compiled('f8(f8)')\ndef doubled(x):\n    return 2.0 * x\n"
+    )
+    for name in ("temporary", "cwd"):
+        (tmp_path / name).mkdir()
+    code = f"""
+import os, pwd, tempfile
+from numba.core import caching
+caching.CacheImpl._locator_classes.remove(caching.InTreeCacheLocator)  # the installation cannot be written
+tempfile.tempdir = {str(tmp_path / "temporary")!r}
+os.chdir({str(tmp_path / "cwd")!r})
+pwd.getpwuid = {{}}.__getitem__  # the system does not know this user
+from trirail.kinematics.closure import doubled
+print(doubled(1.0))
+"""
+    assert run(code, tmp_path) == "2.0"
+    assert not list((tmp_path / "cwd").iterdir())
+    assert list((tmp_path / "temporary").glob("trirail-compiled-*/*/*.nbc"))
+
+
 PACKAGE = Path(compiled.__file__).parents[1]
 FOLDERS = sorted({file.parent for file in PACKAGE.rglob("*.py") if b"\n@compiled(" in file.read_bytes()})
 

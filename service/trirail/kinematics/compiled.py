@@ -100,6 +100,10 @@ def _cached(function: Callable[..., Any], **options: Any) -> Any:
     """
     compile_later = partial(njit, function, error_model="numpy", cache=True, **options)
     dispatcher: Any
+    # Without a home, numba would create a folder named "~" in the working directory.
+    user_cache = os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))
+    if not (config.CACHE_DIR or os.path.isabs(user_cache)):  # type: ignore[attr-defined]
+        config.CACHE_DIR = str(_temporary_cache())  # type: ignore[attr-defined]
     try:
         dispatcher = compile_later()
     except RuntimeError:
