@@ -51,6 +51,17 @@ def open_regular(path: Path) -> BinaryIO:
     return file
 
 
+def expand_home(path: str) -> str:
+    """Return a path with the home folder in place of a leading ~.
+
+    Raises FileError if the home folder is unknown, as that of a user whom the system does not know, without HOME.
+    """
+    expanded = os.path.expanduser(path)
+    if path.startswith("~") and not os.path.isabs(expanded):
+        raise FileError(f"{path}: the home folder is unknown: set HOME")
+    return expanded
+
+
 def text(path: Path, errors: str = "strict") -> str:
     """Return the content of a UTF-8 text file. Raises FileError. `errors` is that of bytes.decode."""
     with open_regular(path) as file:

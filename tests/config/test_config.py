@@ -914,3 +914,7 @@ def test_a_path_may_begin_with_the_home_folder(
     found = str(everything(tmp_path / "robot.toml"))
     assert f"{tmp_path}/home/x" in found
     assert f"{tmp_path}/~" not in found
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    with pytest.raises(ConfigError, match="~/x: the home folder is unknown: set HOME, or write the path without ~"):
+        load(tmp_path / "robot.toml")

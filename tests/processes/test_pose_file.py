@@ -291,3 +291,13 @@ def test_the_state_directory_is_systemd_s_or_the_user_s(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert state_directory("demo") == Path(folder)
+
+
+def test_a_user_without_a_home_is_told_and_poses_are_not_put_in_the_working_directory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("STATE_DIRECTORY", "XDG_STATE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    with pytest.raises(ServiceError, match="the home folder is unknown: set HOME, or set STATE_DIRECTORY"):
+        state_directory("demo")

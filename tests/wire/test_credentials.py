@@ -9,7 +9,7 @@ import pytest
 from certificates import tls_config, user
 from trirail.cli.key_folder import AUTHORITY_KEY, KeyFolder
 from trirail.errors import ServiceError
-from trirail.wire.credentials import KEY, Credentials, check_private, revoked, with_role
+from trirail.wire.credentials import KEY, Credentials, check_private, credentials_for, revoked, with_role
 from trirail.wire.vocabulary import Role
 
 
@@ -51,3 +51,11 @@ def test_a_list_of_the_revoked_that_is_not_understood_lets_nobody_in(tmp_path: P
     else:
         with pytest.raises(ServiceError, match="not text in UTF-8"):
             revoked(tmp_path)
+
+
+def test_a_user_without_a_home_is_told_where_credentials_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("TRIRAIL_TLS", "XDG_CONFIG_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    with pytest.raises(ServiceError, match="the home folder is unknown: set HOME, or set TRIRAIL_TLS"):
+        credentials_for("demo", "tls/127.0.0.1:7447")

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import os
 from pathlib import Path
 from typing import Annotated, Literal, cast
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct, structs
+from trirail_drivers import files
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, DriveIo, Drives, Name, Timeout, Velocity
+from trirail_drivers.errors import FileError
 from trirail_drivers.interface import NAMES, Triple
 
 from trirail.config import as_built
@@ -269,8 +270,14 @@ class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def resolved(path: str, folder: Path) -> str:
-    """Return a path of a configuration file in `folder`, to which it is relative. A leading ~ is the home folder."""
-    return str(folder / os.path.expanduser(path))
+    """Return a path of a configuration file in `folder`, to which it is relative. A leading ~ is the home folder.
+
+    Raises ConfigError if the home folder is unknown.
+    """
+    try:
+        return str(folder / files.expand_home(path))
+    except FileError as error:
+        raise ConfigError(f"{error}, or write the path without ~") from error
 
 
 class Tls(Struct, frozen=True, forbid_unknown_fields=True):

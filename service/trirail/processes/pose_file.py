@@ -48,12 +48,16 @@ prepare(Taught)
 def state_directory(robot: str) -> Path:
     """Return the directory of a robot's persistent data.
 
-    It is in the state directory of the systemd unit if there is one, otherwise in that of the user.
+    It is in the state directory of the systemd unit if there is one, otherwise in that of the user. Raises ServiceError
+    if the user has neither.
     """
     of_unit = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if of_unit:
         return Path(of_unit) / robot
-    base = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    try:
+        base = os.environ.get("XDG_STATE_HOME") or files.expand_home("~/.local/state")
+    except FileError as error:
+        raise ServiceError(f"{error}, or set STATE_DIRECTORY to the folder of the taught poses") from error
     return Path(base) / "trirail" / robot
 
 

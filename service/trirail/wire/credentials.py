@@ -183,11 +183,18 @@ def credentials_for(robot: str, locator: str, folder: Path | str | None = None) 
     are unusable, or if a folder is given although the locator's protocol does not use credentials.
     """
     if reach(locator) is ReachableBy.CERTIFICATE:
-        base = Path(os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config"))
-        return Credentials.read(Path(folder or os.environ.get("TRIRAIL_TLS") or base / "trirail" / robot))
+        return Credentials.read(Path(folder or os.environ.get("TRIRAIL_TLS") or _user_folder(robot)))
     if folder is not None:
         raise ServiceError(f"{locator}: this protocol does not use credentials; connect to tls/HOST:PORT")
     return None
+
+
+def _user_folder(robot: str) -> Path:
+    try:
+        base = os.environ.get("XDG_CONFIG_HOME") or files.expand_home("~/.config")
+    except FileError as error:
+        raise ServiceError(f"{error}, or set TRIRAIL_TLS to the folder of the credentials") from error
+    return Path(base) / "trirail" / robot
 
 
 def _memory_file(content: bytes) -> Path:
