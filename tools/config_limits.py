@@ -68,7 +68,7 @@ BOUNDS = (
     Bound("Zenoh sessions", ("trirail.wire.zenoh_session:SESSIONS sessions",), "not opened"),
     Bound("Connections to the port for stops", ("trirail.processes.stop_port:MAX_CALLERS connections",),
           "the oldest of the address, or of the user, is closed"),
-    Bound("Wait of a goal for those before it", ("trirail.processes.incoming:GOAL_PATIENCE s",),
+    Bound("Wait of a goal until the loop can plan it", ("trirail.processes.incoming:GOAL_PATIENCE s",),
           "refused, `stopped`; a goal may have its own, `valid_for`: `expired`"),
     Bound("Points of a trajectory, in one message and in all",
           ("trirail.wire.sizes:MAX_PART points", "trirail.wire.sizes:MAX_POINTS points"), "refused, `malformed`"),

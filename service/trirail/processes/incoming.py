@@ -187,7 +187,7 @@ GOALS = 5_000
 GOALS_OF_ONE = 1_250
 """Maximum number of waiting goals of one user. It leaves space for the goals of other users."""
 GOAL_PATIENCE = 8.0
-"""Maximum time that a goal waits for earlier goals [s].
+"""Maximum time that a goal waits to be sent to the loop, while earlier goals are planned [s].
 
 After that time, the goal is withdrawn, because its sender stops waiting for the reply soon afterwards.
 """
