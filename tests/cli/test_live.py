@@ -16,6 +16,7 @@ from trirail.cli import live, pendant, terminal
 from trirail.client import picture
 from trirail.client.client import Jog, Robot
 from trirail.config import SIM, load
+from trirail.errors import ServiceError
 from trirail.processes.publications import info
 from trirail.wire.state import (
     CommandedMotion,
@@ -216,6 +217,18 @@ def test_a_state_in_a_pipe_is_neither_wrapped_nor_cut(
             live.show(a_state(faults=tuple(faults)), info(load(SIM)))
             shown.append(capsys.readouterr().out)
     assert shown[0] == shown[1]
+
+
+def test_a_terminal_that_cannot_redraw_gets_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dumb = Console(force_terminal=True, width=200, _environ={"TERM": "dumb"})
+    monkeypatch.setattr(terminal, "out", dumb)
+    monkeypatch.setattr(live, "out", dumb)
+    robot = SimpleNamespace(name="demo", info=lambda: info(load(SIM)), states=lambda _timeout: [a_state()])
+    with pytest.raises(ServiceError, match="no longer sends its state"):
+        live.watch(cast(Robot, robot), json_lines=False)
+    assert capsys.readouterr().out.startswith("1.00 s  holding  ")
 
 
 @pytest.mark.parametrize("show", [True, False])

@@ -18,7 +18,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
-from trirail.cli import pendant
+from rich.console import Console
+from trirail.cli import pendant, terminal
 from trirail.cli.pendant import KEY_TIMEOUT_S, Pendant, keys
 from trirail.client import held_jog, picture
 from trirail.errors import ServiceError
@@ -194,10 +195,23 @@ def test_a_service_of_another_version_is_told_in_one_line(
 ) -> None:
     stream = SimpleNamespace(isatty=lambda: True)
     monkeypatch.setattr(pendant, "sys", SimpleNamespace(stdin=stream, stdout=stream))
+    monkeypatch.setattr(terminal, "can_redraw", lambda: True)
     robot = FakeRobot()
     robot.told = msgspec.structs.replace(robot.told, limits={"platform": {}})
     with pytest.raises(ServiceError, match="the service has another version"):
         show(robot)
+
+
+@pytest.mark.parametrize("kind", ["dumb", "unknown"])
+def test_a_terminal_that_cannot_show_the_pose_takes_no_keys(
+    kind: str, tty_pair: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = SimpleNamespace(isatty=lambda: True, fileno=lambda: tty_pair[1])
+    monkeypatch.setattr(pendant, "sys", SimpleNamespace(stdin=stream, stdout=stream))
+    monkeypatch.setattr(terminal, "out", Console(force_terminal=True, _environ={"TERM": kind}))
+    os.write(tty_pair[0], b"q")
+    with pytest.raises(ServiceError, match="needs a terminal that shows the pose"):
+        pendant.run(FakeRobot())  # type: ignore[arg-type]
 
 
 class Operator:

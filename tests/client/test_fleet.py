@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -131,6 +132,20 @@ def test_into_a_pipe_each_robot_is_a_line_whenever_it_has_changed(
         "demo  fault  drive B: EMCY 8700",
         f"demo  {fleet_command.UNREADABLE}",
     ]
+
+
+def test_a_terminal_that_cannot_redraw_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    printed = []
+
+    def print_changes(*arguments: object) -> None:
+        printed.append(arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("trirail.client.fleet.Fleet", lambda *_: nullcontext())
+    monkeypatch.setattr(fleet_command, "_print_changes", print_changes)
+    monkeypatch.setattr(terminal, "out", Console(force_terminal=True, _environ={"TERM": "dumb"}))
+    assert fleet_command.fleet() == 0
+    assert printed
 
 
 def test_the_table_says_what_each_needs_and_hides_what_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ def fleet(*, service: Service = HERE) -> int:
             terminal.json({"robots": [_as_json(member, now) for member in seen.members()]})
             return 0
         with contextlib.suppress(KeyboardInterrupt):
-            if not terminal.out.is_terminal:
+            if not terminal.can_redraw():
                 _print_changes(seen, never)
             with Live(console=terminal.out, auto_refresh=False) as live:
                 while not never.wait(REFRESH_S):

@@ -20,6 +20,7 @@ from trirail.cli.terminal import (
     COLOURS,
     SERVICE_TIMEOUT_S,
     budget_share,
+    can_redraw,
     end_with_reader,
     json,
     left,
@@ -65,7 +66,7 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
         if json_lines:
             for state in end_with_reader(robot.states(SERVICE_TIMEOUT_S)):
                 json(msgspec.to_builtins(state))
-        elif not out.is_terminal:
+        elif not can_redraw():
             _print_once_a_second(robot)
         else:
             with Live(console=out, refresh_per_second=10, transient=False) as live:
@@ -75,7 +76,7 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
 
 
 def _print_once_a_second(robot: Robot) -> None:
-    """Print the state as a line once a second, for a file or pipe, where a table cannot be redrawn."""
+    """Print the state as a line once a second, where a table cannot be redrawn."""
     due = -math.inf
     for state in end_with_reader(robot.states(SERVICE_TIMEOUT_S)):
         if time.monotonic() >= due:

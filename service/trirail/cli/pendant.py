@@ -179,11 +179,12 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
     """Run the pendant until the operator leaves or the terminal closes; return the exit code.
 
     Keys move the `tool` or, if there is none, the platform's centre. Raises ServiceError if standard input is not a
-    terminal or the service does not answer.
+    terminal that can show the pose, or the service does not answer.
     """
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not (sys.stdin.isatty() and sys.stdout.isatty() and terminal.can_redraw()):
         raise ServiceError(
-            "jogging with keys needs a terminal; without a terminal, use trirail jog VX VY W --seconds S"
+            "jogging with keys needs a terminal that shows the pose, which TERM=dumb does not; without such a terminal, "
+            "use trirail jog VX VY W --seconds S"
         )
     info = robot.info()
     top = live.limits_of(info).platform.velocity

@@ -110,6 +110,11 @@ class Terminated(BaseException):
         self.number = number
 
 
+def can_redraw() -> bool:
+    """Return True if standard output is a terminal on which a display can be redrawn, unlike one with TERM=dumb."""
+    return out.is_terminal and not out.is_dumb_terminal
+
+
 def plain(words: str) -> str:
     """Return external text for the console, without markup, control characters or line breaks."""
     return escape(printable(words))
