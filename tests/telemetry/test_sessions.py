@@ -614,3 +614,26 @@ def test_a_damaged_sidecar_is_none(tmp_path: Path, damage: dict[str, Any]) -> No
     beside = sidecar(recording)
     beside.write_text(json.dumps(json.loads(beside.read_text()) | damage))
     assert contents.load(recording) is None
+
+
+@pytest.mark.parametrize("step_s", [20 * 365 * 86400, -3600])
+def test_a_session_lasts_as_long_as_it_was_recorded_even_if_the_clock_is_set(
+    step_s: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A computer without a battery for its clock has the right time only after the service has started."""
+    time = Time("2026-01-31 12:00:00")
+    recording = Recorder(
+        configured(), tmp_path, sidecars=True, live=False, wall_ns=time.wall, monotonic_ns=time.monotonic
+    )
+    sent = made.records(4.0)
+    for start in range(0, len(sent), 50):
+        if start == len(sent) // 2:
+            time.wall_ns += step_s * 1_000_000_000
+        time.ns = int(sent["deadline_ns"][start + 49])
+        recording.records(sent[start : start + 50].tobytes())
+        recording.save()
+    recording.close()
+    for options in ((), ("--rebuild",)):
+        assert [session.duration for session in sessions(tmp_path, *options)] == [4.0]
+    assert app(["sessions", str(tmp_path)], exit_on_error=False, result_action="return_value") == 0
+    assert "  0:00:04  " in capsys.readouterr().out

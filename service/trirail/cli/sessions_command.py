@@ -152,9 +152,9 @@ def _print(listed: list[RecordedSession], of: int) -> None:
 
 
 def _lasted(session: RecordedSession) -> str:
-    if session.began is None or session.ended is None or session.ended < session.began:  # the clock was set back
+    if session.began is None:
         return ""
-    minutes, seconds = divmod(round(session.ended - session.began), 60)
+    minutes, seconds = divmod(round(session.duration), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{seconds:02}"
 

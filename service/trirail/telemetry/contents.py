@@ -67,6 +67,15 @@ class Contents(msgspec.Struct):
     """Version of the format of the sidecar; sidecars of other versions are ignored."""
     lost_cycles: int = 0
     """Number of cycles that the recorder could not write; 0 if the contents were read from the recording."""
+    rate_hz: int = 0
+    """Cycles per second; 0 if unknown, as in sidecars of earlier versions."""
+
+    @property
+    def duration(self) -> float:
+        """Time that was recorded [s], from the cycles, because the wall clock may have been set meanwhile."""
+        if self.rate_hz > 0:
+            return self.cycles / self.rate_hz
+        return max(0.0, self.ended - self.began) if self.began is not None and self.ended is not None else 0.0
 
     @property
     def session(self) -> str:
@@ -133,7 +142,7 @@ def read_contents(path: Path) -> Contents:
         contents.trouble = str(error)
         return contents
     if config is not None:
-        contents.robot = config.robot.name
+        contents.robot, contents.rate_hz = config.robot.name, config.loop.rate_hz
     began, ended = (float(wall.astype("datetime64[ns]").astype(int)) * 1e-9 for wall in recording.wall[[0, -1]])
     contents.add_cycles(began, ended, len(recording.records))
     for line in recording.events:

@@ -296,7 +296,8 @@ class Recorder:
     def _open(self, path: Path) -> rr.RecordingStream:
         """Begin a new file with all data that a viewer needs to show the file without earlier files."""
         self._write_sidecar()
-        self._contents = Contents(path.name, self._config.robot.name, reason=self._reason)
+        name, rate_hz = self._config.robot.name, self._config.loop.rate_hz
+        self._contents = Contents(path.name, name, reason=self._reason, rate_hz=rate_hz)
         stream = self._streams.open(rr.FileSink(path))
         for entity, text in provenance.text_documents(self._config).items():
             stream.log(entity, rr.TextDocument(encodable(text)), static=True)

@@ -54,6 +54,8 @@ class RecordedSession(Struct):
     """True while the session is still being recorded. The values are then some seconds old."""
     lost_cycles: int = 0
     """Number of cycles that could not be written, for example because the disk was full."""
+    duration: float = 0.0
+    """Time that was recorded [s], even if the wall clock was set meanwhile."""
 
 
 def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], None] | None = None) -> list[Contents]:
@@ -149,6 +151,7 @@ def _joined(parts: list[Contents]) -> RecordedSession:
         faults=[entry.message for entry in faults],
         running=any(part.running for part in parts),
         lost_cycles=sum(part.lost_cycles for part in parts),
+        duration=sum(part.duration for part in parts),
     )
 
 

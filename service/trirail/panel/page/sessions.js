@@ -36,12 +36,12 @@ export class Sessions {
   }
 }
 
-function row(made, { session, began, ended, goals, faults, files, reason, trouble, running, lost_cycles: lost }) {
+function row(made, { session, began, duration, goals, faults, files, reason, trouble, running, lost_cycles: lost }) {
   const counts = Object.entries(goals).map(([outcome, times]) => `${times} ${outcome}`).join(", ");
   const wrong = [trouble ?? reason ?? faults[0] ?? "", !reason && faults.length > 1 ? ` (+${faults.length - 1})` : ""].join("");
   made.append(
     cell("td", quoted(began === null ? "–" : date(began))),
-    cell("td", quoted(began === null || ended === null ? "–" : lasted(ended - began)), running ? ` ${say("sessions.running")}` : ""),
+    cell("td", quoted(began === null ? "–" : lasted(duration)), running ? ` ${say("sessions.running")}` : ""),
     cell("td", quoted(counts || "–")),
     cell("td", reason && !trouble ? `${say("sessions.black_box")} ` : "", quoted(wrong || "–"), lost ? ` ${say("sessions.lost", { lost })}` : ""),
     cell("td", link(say("sessions.report"), `report/${encodeURIComponent(session)}`), ...files.flatMap((name) => [" ", saved(name)])),
@@ -72,7 +72,6 @@ function saved(name) {
 }
 
 function lasted(seconds) {
-  if (seconds < 0) return "–"; // the clock was set back
   const [hours, minutes, rest] = [seconds / 3600, (seconds / 60) % 60, seconds % 60].map(Math.floor);
   return `${hours}:${String(minutes).padStart(2, "0")}:${String(rest).padStart(2, "0")}`;
 }
