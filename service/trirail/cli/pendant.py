@@ -183,8 +183,8 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty() and terminal.can_redraw()):
         raise ServiceError(
-            "jogging with keys needs a terminal that shows the pose, which TERM=dumb does not; without such a terminal, "
-            "use trirail jog VX VY W --seconds S"
+            "jogging with keys needs a terminal that shows the pose, which TERM=dumb does not; without such a "
+            "terminal, use trirail jog VX VY W --seconds S"
         )
     info = robot.info()
     top = live.limits_of(info).platform.velocity
