@@ -61,7 +61,9 @@ def test_what_is_left_after_one_correction(file: str) -> None:
 
 
 def test_how_far_the_gauge_shows_the_kinds_apart() -> None:
-    said = re.search(r"two kinds differ by about (\S+) µm. At 5° they differ by (\S+) to (\S+) mm", " ".join(GUIDE.split()))
+    said = re.search(
+        r"two kinds differ by about (\S+) µm. At 5° they differ by (\S+) to (\S+) mm", " ".join(GUIDE.split())
+    )
     assert said is not None
     at_1, *at_5 = map(float, said.groups())
     robot = geometry(load(SIM.with_name("uvw.toml")).geometry)
@@ -69,7 +71,7 @@ def test_how_far_the_gauge_shows_the_kinds_apart() -> None:
     def apart(degrees: float) -> Array:
         pose = 0.0, 0.0, math.radians(degrees)
         one, other = (np.subtract(*travels(each, [pose, (0.0, 0.0, 0.0)])[0]) for each in (robot, other_kind(robot)))
-        return np.abs(one - other)
+        return np.array(abs(one - other))
 
     assert apart(1.0) * 1e6 == pytest.approx([at_1] * 3, abs=1.0)
     assert [min(apart(5.0) * 1e3), max(apart(5.0) * 1e3)] == pytest.approx(at_5, abs=0.0051)
