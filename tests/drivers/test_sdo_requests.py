@@ -317,10 +317,16 @@ def test_a_set_up_that_is_interrupted_has_its_last_answer_awaited(closing: Closi
     assert len(rig.overlaps) <= 3
 
 
+@pytest.mark.parametrize("lost", [1, 4])
+@pytest.mark.parametrize("switches", [False, True])
 @pytest.mark.parametrize("when", range(0, 60, 7))
-def test_one_lost_answer_to_a_poll_is_no_fault(closing: Closing, when: int) -> None:
-    rig = closing(SlowRig(0.0, "queues"))
+def test_a_few_lost_answers_of_a_drive_that_is_asked_for_its_statusword_are_no_fault(
+    closing: Closing, when: int, switches: bool, lost: int
+) -> None:
+    """Answers to polls, also if an output is switched by SDO meanwhile."""
+    rig = closing(SlowRig(0.0, "queues", io=IO))
     rig.enabled_within = 200
+    rig.devices[0].objects[0x60FE, 1].mappable = False
     rig.ready()
     axis = rig.drives._axes[0]
     axis.exchange = replace(axis.exchange, polled=True)
@@ -328,7 +334,10 @@ def test_one_lost_answer_to_a_poll_is_no_fault(closing: Closing, when: int) -> N
     rig.devices[0]._route()
     rig.enable()
     rig.cycles(when)
-    rig.bus.faults.add("A drop sdo-answer for 1 frames")
+    if switches:
+        rig.drives.set_outputs((VALVE, 0, 0))
+    rig.bus.faults.add(f"A drop sdo-answer for {lost} frames")
     rig.bus.sent.clear()
     assert rig.cycles(1000).fault is None
     assert (canopen_frames.SDO_REQUEST + rig.devices[0].node, canopen_frames.STATUSWORD_UPLOAD) in rig.bus.sent
+    assert rig.devices[0].pins.bits == VALVE * switches

@@ -274,3 +274,14 @@ def test_only_functions_that_say_so_create_arrays(room: Path, tmp_path: Path) ->
 def test_no_function_of_a_cycle_creates_arrays(folder: str) -> None:
     files = (Path(compiled.__file__).parents[1] / folder).rglob("*.py")
     assert not [file.name for file in files if "@compiled" in (text := file.read_text()) and "allocates=True" in text]
+
+
+def test_only_functions_that_may_create_arrays_return_arrays() -> None:
+    """A caller with `allocates` would free an array that another function returns too early."""
+    import trirail.motion.path_planner
+    import trirail.processes.loop  # noqa: F401
+
+    returned = {each.py_func.__name__: str(each.py_func.__annotations__["return"]) for each in compiled._functions}
+    assert [name for name, kind in returned.items() if "Array" in kind] == ["_sample_times"]
+    (sampling,) = (each for each in compiled._functions if each.py_func.__name__ == "_sample_times")
+    assert sampling.targetoptions["_nrt"]

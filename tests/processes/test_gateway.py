@@ -323,6 +323,17 @@ def test_a_call_that_sends_goals_later_ends_with_a_stop_of_any_user(
     assert [withdrawn for _, withdrawn in rig.goals()] == [reason, None, None]
 
 
+def test_stops_that_were_merged_and_read_late_end_calls(rig: Rig) -> None:
+    announced, merged = CallMark(new_connection(), 5), CallMark(new_connection(), 5)
+    rig.gateway._handle(came("role", "trirail/demo/role/ann", b"", 5)._replace(mark=announced))
+    alike = came("cmd", "trirail/demo/cmd/ann/stop", b"", 10)._replace(mark=merged)
+    rig.gateway._handle(came("cmd", "trirail/demo/cmd/ann/stop", b"", 9)._replace(alike=(alike,)))
+    rig.command("stop", number=3)
+    for mark in (announced, merged._replace(called_ns=4), merged._replace(called_ns=6)):
+        rig.gateway._handle(came("goal", "trirail/demo/goal/ann", POSE, 11)._replace(mark=mark))
+    assert [withdrawn for _, withdrawn in rig.goals()] == ["stop by ann", "stop by ann", None]
+
+
 def test_what_was_called_at_the_time_of_a_stop_is_carried_out(rig: Rig) -> None:
     """A call may stop the robot first, and then move it."""
     mark = CallMark(new_connection(), 5)

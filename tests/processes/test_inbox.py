@@ -215,9 +215,11 @@ def test_what_is_too_large_is_refused_when_it_comes_and_its_memory_is_not_held(t
             stop.content(type(None), "")
 
 
-def test_calls_are_read_from_requests_and_from_both_copies_of_a_stop(tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", ["", ".1", ".a-b_c"])
+def test_calls_are_read_from_requests_and_from_both_copies_of_a_stop(tmp_path: Path, end: str) -> None:
+    """`end`: what another program may write after the mark instead of what the client writes."""
     locator, mark = f"unixsock-stream/{tmp_path}/z", CallMark(new_connection(), 12_345)
-    name = mark.new_id()
+    name = f"{mark}{end}" if end else mark.new_id()
     with zenoh_session.open_service([locator]) as opened, zenoh_session.open_client(locator) as client:
         inbox = Inbox(opened, "demo", KEYS, lambda incoming, error: None)
         inbox.declare()

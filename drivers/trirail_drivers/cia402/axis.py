@@ -27,6 +27,8 @@ FOLLOW_TIME = STATUS_WITHIN
 """Longest time until an enabled drive reports that it follows setpoints [s]."""
 REGISTER_TIME = 0.5
 """Longest time until a drive reports its error register after a reset [s]."""
+SUPERVISED_ANSWER_TIME = canopen_frames.STATUS_PERIOD / 2
+"""Like ANSWER_TIME, of a drive whose statusword is requested by SDO [s]."""
 ANSWER_TIME = 0.5
 """Longest time until a drive answers an SDO request from the cycle [s]. A set-up waits this long before it starts."""
 STANDSTILL_DISTANCE_M = 2e-5
@@ -151,8 +153,9 @@ class Cia402Axis(Axis):
             self._statusword_asked, self._overtaken = True, False
         if self.unanswered:  # the drive may lose the earlier request
             self.word_by_sdo, self.outputs_sent = None, NOTHING_SENT
-        supervises = request in _POLLS and not self.left_operational  # one lost answer must not become a fault
-        self._pending.begin(now, request, canopen_frames.STATUS_PERIOD if supervises else ANSWER_TIME)
+        # Until an answer is counted as lost, no statusword is requested; a few lost answers must not become a fault.
+        supervises = (request in _POLLS or self.exchange.polled) and not self.left_operational
+        self._pending.begin(now, request, SUPERVISED_ANSWER_TIME if supervises else ANSWER_TIME)
 
     @property
     def unanswered(self) -> bool:

@@ -202,7 +202,6 @@ class Gateway:
 
         An error is sent in the reply and is also announced to all clients, because a put has no reply.
         """
-        self._requests.backlog.note_call(incoming)
         try:
             route = ROUTES[incoming.kind]
             if (reply := route.handle(self, route.read(incoming, self._robot))) is not None:
@@ -218,6 +217,7 @@ class Gateway:
 
     def _user_role(self, message: RoutedMessage) -> RoleReply:
         (user,) = message.names
+        self._requests.backlog.note_call(message.incoming)
         return RoleReply(user, self._guard.role(user))
 
     def _edit_poses(self, message: RoutedMessage) -> None:

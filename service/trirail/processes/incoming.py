@@ -216,7 +216,7 @@ class Backlog:
         self._stop_calls: dict[str, tuple[int, str]] = {}
         """Times of the newest calls of stops [ns], by connection, and their reasons."""
         self._calls: dict[CallMark, int] = {}
-        """Number of the first message of each call. A call may send more messages later, such as an alignment."""
+        """Number of the message that has announced each call that sends goals later, such as an alignment."""
         self._stopped: dict[str, tuple[int, str]] = {}
         """Stops of single goals, by goal id. The values are the number of the stop's message, and the reason."""
 
@@ -302,7 +302,7 @@ class Backlog:
             raise RefusedError(RefusalCode.STOPPED, f"not carried out: {reason} was called later and came first")
 
     def note_call(self, incoming: Incoming) -> None:
-        """Store the number of the first message of a call."""
+        """Store the number of a message that announces a call."""
         if incoming.mark is not None:
             first = self._calls.pop(incoming.mark, incoming.number)
             self._calls[incoming.mark] = min(first, incoming.number)

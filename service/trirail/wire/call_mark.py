@@ -10,7 +10,7 @@ import re
 import uuid
 from typing import NamedTuple
 
-_MARK = re.compile(r"([0-9a-f]{12})\.([0-9]{1,19})(?:\.[0-9a-f]{12})?")
+_MARK = re.compile(r"([0-9a-f]{12})\.([0-9]{1,19})(?:\..*)?", re.DOTALL)
 
 
 class CallMark(NamedTuple):
