@@ -323,6 +323,17 @@ def test_a_call_that_sends_goals_later_ends_with_a_stop_of_any_user(
     assert [withdrawn for _, withdrawn in rig.goals()] == [reason, None, None]
 
 
+def test_the_first_state_follows_when_requests_can_be_received(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    monkeypatch.setattr(rig.gateway._inbox, "declare", lambda: order.append("requests"))
+    monkeypatch.setattr(rig.gateway._publications, "state", lambda state: order.append("state"))
+    monkeypatch.setattr(rig.gateway, "_welcomed", True)
+    for cycle in (1, 2):
+        rig.record(cycle)
+        rig.gateway._state_due = 0.0
+    assert order == ["requests", "state"]
+
+
 def test_stops_that_were_merged_and_read_late_end_calls(rig: Rig) -> None:
     announced, merged = CallMark(new_connection(), 5), CallMark(new_connection(), 5)
     rig.gateway._handle(came("role", "trirail/demo/role/ann", b"", 5)._replace(mark=announced))

@@ -334,7 +334,7 @@ class Gateway:
             self._meter.records(rows)
             self._meter.publish(self._states.newest, self._link_monitor.use, self._link_monitor.warnings())
         now = self._records_at = time.monotonic()
-        if now >= self._state_due:
+        if now >= self._state_due and self._declared:  # who receives a state may ask at once
             self._state_due = max(self._state_due + self._state_every, now)
             self._publications.state(self._states.newest(self.warnings()))
 
@@ -344,7 +344,7 @@ class Gateway:
         The summary is published even while the loop is silent, because it contains the age of the state.
         """
         now = time.monotonic()
-        if now >= self._summary_due and self._states.cycle:
+        if now >= self._summary_due and self._declared:
             self._summary_due = now + SUMMARY_EVERY
             self._publications.summary(summary_of(self._states.newest(), now - self._records_at, self._info.version))
 
