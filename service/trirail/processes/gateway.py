@@ -334,7 +334,7 @@ class Gateway:
             self._meter.records(rows)
             self._meter.publish(self._states.newest, self._link_monitor.use, self._link_monitor.warnings())
         now = self._records_at = time.monotonic()
-        if now >= self._state_due and self._declared:  # who receives a state may ask at once
+        if now >= self._state_due and self._declared:  # a client may send a request as soon as it has a state
             self._state_due = max(self._state_due + self._state_every, now)
             self._publications.state(self._states.newest(self.warnings()))
 
