@@ -1,6 +1,7 @@
 """The simulated camera: its marks are where they are found, and motion moves and smears them as it should."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,6 +49,25 @@ def test_a_moving_mark_is_where_it_was_at_the_middle_of_its_exposure_and_smeared
     moved, smeared = moving(0.01)
     assert moved - u == pytest.approx(-0.01 * 0.012 * 2.5e5, abs=0.2)
     assert smeared < 0.5 * sharp
+
+
+def test_all_poses_of_an_exposure_are_read_before_the_picture_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes seconds on a slow machine, and the positions of a stage are kept only for seconds."""
+    done: list[str] = []
+    rendered = SimulatedCamera._render_marks
+
+    def render(camera: SimulatedCamera, pose: Triple) -> Any:
+        done.append("draw")
+        return rendered(camera, pose)
+
+    def pose_at(_time: float) -> Triple:
+        done.append("read")
+        return 0.0, 0.0, 0.0
+
+    monkeypatch.setattr(SimulatedCamera, "_render_marks", render)
+    SHARP._replace(exposure=0.004).picture(pose_at, 0.0, np.random.default_rng(0))
+    assert done == sorted(done, reverse=True)
+    assert done.count("draw") == done.count("read") > 1
 
 
 def test_a_mark_outside_is_not_in_the_picture() -> None:

@@ -55,7 +55,8 @@ class SimulatedCamera(NamedTuple):
             instants = end - self.exposure * (np.arange(EXPOSURE_SAMPLES) + 0.5) / EXPOSURE_SAMPLES
         else:
             instants = np.array([end])
-        light = sum((self._render_marks(pose_at(float(t))) for t in instants), np.zeros((self.rows, self.columns)))
+        poses = [pose_at(float(t)) for t in instants]  # all before rendering, because `pose_at` may forget old poses
+        light = sum((self._render_marks(pose) for pose in poses), np.zeros((self.rows, self.columns)))
         shown = (self.ground + self.contrast * light / len(instants)) * self._shading()
         shown = shown + self.noise * rng.standard_normal(shown.shape)
         return np.clip(np.rint(shown), 0, MAX_BRIGHTNESS).astype(np.uint8)

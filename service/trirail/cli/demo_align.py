@@ -61,14 +61,13 @@ class DrawnCameras:
     def capture(self) -> dict[str, Pair]:
         """Take a picture with each camera, find the disc in the picture, and show both."""
         marks: dict[str, Pair] = {}
-        now = time.monotonic()
-        self._stream.set_time("time", duration=now)
+        self._stream.set_time("time", duration=time.monotonic())
         for name, place in self.part.items():
             marks_there = {name: DrawnMark(DISC, place)}
             camera = SimulatedCamera(
                 VIEWS[name], marks_there, *SIZE, noise=3.0, shade=0.4, exposure=EXPOSURE, delay=DELAY
             )
-            picture = camera.picture(self._stage.pose_at, now, self._rng)
+            picture = camera.picture(self._stage.pose_at, time.monotonic(), self._rng)
             disc = find(picture, MarkShape("disc", DISC.size * VIEWS[name].scale))
             if disc is not None:
                 marks[name] = (disc.u, disc.v)
