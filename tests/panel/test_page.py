@@ -225,6 +225,19 @@ def test_stop_from_wherever_one_is(enabled: Page, robot: FakeRobot, by: str) -> 
     enabled.let_go()
 
 
+@pytest.mark.parametrize("by", ["mouse", "Space", "Escape"])
+def test_stop_while_a_list_is_open(enabled: Page, robot: FakeRobot, by: str) -> None:
+    robot.mode, robot._alive_until = "moving", float("inf")
+    enabled.click("#language")
+    enabled.until("document.querySelector('#language').matches(':open')")
+    if by == "mouse":
+        enabled.press("#stop")
+        enabled.let_go()
+    else:
+        enabled.type_key(by)
+    wait_until(lambda: robot.commands.count("stop") == 1, "a stop")
+
+
 def test_stop_waits_for_no_command_under_way(enabled: Page, robot: FakeRobot) -> None:
     with robot.hanging("pause"):
         enabled.key_down("ArrowRight")
