@@ -522,7 +522,25 @@ def _request_decision(
 
 
 @compiled()
-def _run_cycle(
+def _exchange(
+    state: NDArray[np.void],
+    moment: NDArray[np.int64],
+    neighbours: Neighbours,
+    frames: FrameTables,
+    robot: RobotArrays,
+    motion: MotionArrays,
+    rehearsal: Rehearsal,
+) -> int:
+    """Run the first half of a cycle: wait for the tick, send the SYNC, and read the drives' answers.
+
+    Return CONTINUE, or the reached stage if Python must go on, for instance because a frame was unexpected.
+    """
+    reached = _begin(state, moment, neighbours, frames, motion, rehearsal)
+    return reached if reached != CONTINUE else _read(state, moment, neighbours, frames, robot.feedback)
+
+
+@compiled()
+def _finish(
     state: NDArray[np.void],
     moment: NDArray[np.int64],
     neighbours: Neighbours,
@@ -530,15 +548,13 @@ def _run_cycle(
     robot: RobotArrays,
     motion: MotionArrays,
     tables: OutputArrays,
-    rehearsal: Rehearsal,
 ) -> int:
-    """Run one cycle. Return CONTINUE, or the stage that it has reached if Python must go on."""
+    """Run the second half of a cycle: compute the setpoints, send them with the outputs, and write the record.
+
+    Return CONTINUE, or the reached stage if Python must go on.
+    """
     s = state[0]
-    reached = _begin(state, moment, neighbours, frames, motion, rehearsal)
-    if reached == CONTINUE:
-        reached = _read(state, moment, neighbours, frames, robot.feedback)
-    if reached == CONTINUE:
-        reached = solve(state, moment, frames, robot, motion)
+    reached = solve(state, moment, frames, robot, motion)
     if reached != CONTINUE:
         return reached
     if not _switch_outputs(s, frames.axes, robot.record, motion, tables):
@@ -576,7 +592,9 @@ def _run_cycles(
                 requested = _request_decision(state, moment, neighbours, motion, tables, copies)
                 if requested and s.injected_ns >= 0:
                     return Reached.DONE
-        reached = _run_cycle(state, moment, neighbours, frames, robot, motion, tables, rehearsal)
+        reached = _exchange(state, moment, neighbours, frames, robot, motion, rehearsal)
+        if reached == CONTINUE:
+            reached = _finish(state, moment, neighbours, frames, robot, motion, tables)
         if reached != CONTINUE:
             return reached
         if (s.called or s.decides) and not s.deciding:
