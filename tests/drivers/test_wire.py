@@ -15,9 +15,12 @@ from collections.abc import Iterator
 import carriers
 import pytest
 from carriers import FarEnd
+from hypothesis import example, given
+from hypothesis import strategies as st
 from trirail_drivers.bus import wire as wires
 from trirail_drivers.bus.can_frame import ERROR, EXTENDED, REMOTE
 from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.interface import DriveFault
@@ -114,6 +117,37 @@ def test_a_queue_that_was_full_before_the_first_cycle_counts_as_one_cycle(rig: R
     assert rig.wire.fault is None
     rig.cycle(full=True)
     assert rig.wire.fault is not None
+
+
+@given(
+    cycles=st.lists(st.sampled_from(["accepted", "refused", "accepted, refused", "idle"]), max_size=12),
+    way=st.sampled_from([*carriers.WAYS]),
+)
+@example(cycles=["accepted"] * 2 + ["refused", "accepted"], way="socket")
+def test_a_reopened_bus_works_again_after_three_cycles_in_a_row_without_a_refused_frame(
+    cycles: list[str], way: str
+) -> None:
+    """Although no frame arrives. A cycle in which no frame is sent proves nothing."""
+    with rigged(way) as rig:
+        reopening = Reopening("can0", lambda: rig.bus, lambda work: work())
+        wire = Wire(AbsentBus("can0"), BusTiming(1_000_000), rig.stop, reopening)
+        wire.lose("it is unplugged")
+        wire.begin(0.0)
+        wire.begin(0.0)
+        row = 0
+        for cycle in cycles:
+            rig.drain()
+            if "accepted" in cycle:
+                assert wire.send(Frame(0x080))
+            if "refused" in cycle:
+                rig.fill()
+                assert not wire.send(Frame(0x080))
+            row = 0 if "refused" in cycle else row + (cycle == "accepted")
+            wire.begin(0.0)
+            assert (wire.down == "") == (row == 3)
+            if row == 3:
+                assert wire.warnings()[-1] == "CAN bus can0 is up again"
+                break
 
 
 def test_frames_are_taken_in_up_to_a_number_and_then_the_cycle_goes_on(

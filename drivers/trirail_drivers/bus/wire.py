@@ -90,9 +90,9 @@ class Wire:
 
         `stopping` means that drives may still be stopping.
         """
-        # Only cycles in which a frame was sent count: an idle bus proves nothing.
-        if self._trial is not None and self._sent:
-            self._trial = 0 if self._unsent else self._trial + 1
+        # A cycle in which no frame was sent does not count: an idle bus proves nothing.
+        if self._trial is not None:
+            self._trial = 0 if self._unsent else self._trial + self._sent
         self._unsent_cycles = self._unsent_cycles + 1 if self._unsent else 0
         self._unsent = self._sent = False
         if self.down and self._reopening is not None:
