@@ -196,8 +196,15 @@ def test_a_goal_that_is_being_planned_when_another_acquires_it_does_not_begin(us
 
 def test_a_lease_of_another_client_of_the_same_user_is_not_taken_in_silence(users: Users) -> None:
     users.tell("ann", "acquire", "l")
-    assert code(users.tell("ann", "acquire", "m")) is RefusalCode.LEASED
-    assert code(users.tell("ann", "release", "m")) is RefusalCode.LEASED
+    for user, holder in (("ann", "another client of the same user"), ("bob", "ann")):
+        refused = users.tell(user, "acquire", "m")
+        assert isinstance(refused, Refused)
+        words = f"{holder} holds the lease: wait until it is free, or take it over"
+        assert (refused.code, refused.message) == (RefusalCode.LEASED, words)
+        refused = users.tell(user, "release", "m")
+        assert isinstance(refused, Refused)
+        words = f"{holder} holds the lease: only the holder can release it"
+        assert (refused.code, refused.message) == (RefusalCode.LEASED, words)
     assert users.rig.control.lease.user == "ann"
     users.tell("ann", "release")  # whichever it is
     assert users.rig.control.lease.user is None

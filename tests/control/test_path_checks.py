@@ -9,7 +9,7 @@ from control.test_plan_requests import Meddler
 from control_rig import ControlRig, expected_duration
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.kinds.named import NamedGoal
-from trirail.wire.marks import Mark
+from trirail.wire.marks import Mark, StopAt
 from trirail.wire.messages import GoalReply
 from trirail.wire.packed_trajectory import packed
 from trirail.wire.packets import Accepted, Checked, CheckRequest, Disturbance, PlannerLost, Refused
@@ -104,6 +104,7 @@ def test_each_kind_with_a_path_is_checked(rig: ControlRig) -> None:
     assert code(rig, MoveGoal(0.01, 0.0, 0.0, frame="nowhere")) == "unknown_frame"
     assert code(rig, NamedGoal("nowhere")) == "unknown_pose"
     assert code(rig, PoseGoal(0.05, 0.0, 0.0, marks=(Mark("valve", after_start=0.0),))) == "unknown_output"
+    assert code(rig, PoseGoal(0.05, 0.0, 0.0, stop_at=StopAt("probe"))) == "unknown_output"
 
 
 def test_during_a_motion_a_check_begins_at_its_end(rig: ControlRig) -> None:
