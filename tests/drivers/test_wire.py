@@ -128,26 +128,29 @@ def test_a_reopened_bus_works_again_after_three_cycles_in_a_row_without_a_refuse
     cycles: list[str], way: str
 ) -> None:
     """Although no frame arrives. A cycle in which no frame is sent proves nothing."""
-    with rigged(way) as rig:
-        reopening = Reopening("can0", lambda: rig.bus, lambda work: work())
-        wire = Wire(AbsentBus("can0"), BusTiming(1_000_000), rig.stop, reopening)
-        wire.lose("it is unplugged")
-        wire.begin(0.0)
-        wire.begin(0.0)
-        row = 0
-        for cycle in cycles:
-            rig.drain()
-            if "accepted" in cycle:
-                assert wire.send(Frame(0x080))
-            if "refused" in cycle:
-                rig.fill()
-                assert not wire.send(Frame(0x080))
-            row = 0 if "refused" in cycle else row + (cycle == "accepted")
-            wire.begin(0.0)
-            assert (wire.down == "") == (row == 3)
-            if row == 3:
-                assert wire.warnings()[-1] == "CAN bus can0 is up again"
-                break
+    with rigged(way) as first, rigged(way) as second:
+        opened = [second.bus, first.bus]
+        reopening = Reopening("can0", opened.pop, lambda work: work())
+        wire = Wire(AbsentBus("can0"), BusTiming(1_000_000), first.stop, reopening)
+        for number, rig in enumerate((first, second)):
+            wire.lose("it is unplugged")
+            wire.begin(10.0 * number)
+            wire.begin(10.0 * number)
+            assert wire.bus is rig.bus
+            row = 0
+            for cycle in (*cycles, *["accepted"] * 3):
+                rig.drain()
+                if "accepted" in cycle:
+                    assert wire.send(Frame(0x080))
+                if "refused" in cycle:
+                    rig.fill()
+                    assert not wire.send(Frame(0x080))
+                row = 0 if "refused" in cycle else row + (cycle == "accepted")
+                wire.begin(10.0 * number)
+                assert (wire.down == "") == (row == 3)
+                if row == 3:
+                    break
+            assert wire.warnings()[-1] == "CAN bus can0 is up again"
 
 
 def test_frames_are_taken_in_up_to_a_number_and_then_the_cycle_goes_on(
