@@ -311,7 +311,8 @@ class Control:
         before = self.measured.feedback
         if behind is None:
             behind = self.measured.update(feedback, self._at_rest)
-        if self.state.mode in (Mode.DISABLED, Mode.FAULT):
+        # A slider that is watched when the drives get power is watched to the end.
+        if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self._returning.watches_jump:
             self._report_jumps(feedback)
         self.report_feedback(before, feedback)
         if not self.ahead:
