@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import product
 
-from control_rig import CONFIG
+import msgspec
+import pytest
+from control_rig import CONFIG, ControlRig
 from trirail.config import geometry
-from trirail.control.commands import EFFECTS, CommandProgress, powered_message
+from trirail.control.commands import EFFECTS, SETTLE, CommandProgress, power_left, powered_drives, powered_message
 from trirail.control.feedback import MeasuredState
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers.interface import DriveFault, Feedback, PowerState
+from trirail_drivers.interface import DriveFault, Feedback, PowerState, Unready
 
 P = PowerState
 OFF, ON = P.SWITCH_ON_DISABLED, P.OPERATION_ENABLED
@@ -105,3 +107,24 @@ def test_still_powered_names_the_drives_that_can_move() -> None:
         states, _, advice = powered_message(measured, WHY).partition(" according to the last statusword: ")
         assert states == (f"drive {drive} is {state}" if state in CAN_MOVE else "")
         assert advice == f"send reset again when the drives are at rest (fault: {WHY})"
+
+
+def test_power_that_is_left_is_that_of_drives_that_can_move_or_are_silent_after_a_stop() -> None:
+    for _, state, measured in one_of_three():
+        assert power_left(measured) == (powered_drives(measured) if state in CAN_MOVE else "")
+        measured.feedback = measured.feedback._replace(unready=(None, Unready(WHY), None))
+        assert power_left(measured) == (powered_drives(measured) if state in CAN_MOVE else "")
+    for cause, silent in product(("timeout", "silent"), (False, True)):
+        measured = saying(fault=DriveFault("B", cause, 0, "it has not stopped"))
+        measured.feedback = measured.feedback._replace(unready=(None, Unready(WHY) if silent else None, None))
+        left = cause == "timeout" and silent
+        assert power_left(measured) == ("it has not stopped, and does not answer" if left else "")
+
+
+@pytest.mark.parametrize("rate_hz", [10, 100, 1000])
+def test_a_reset_is_answered_when_the_drives_had_time_to_leave_their_faults(rate_hz: int) -> None:
+    rig = ControlRig(msgspec.structs.replace(CONFIG, loop=msgspec.structs.replace(CONFIG.loop, rate_hz=rate_hz)))
+    rig.command("quick_stop")
+    before = rig.control.cycles
+    rig.command("reset")
+    assert rig.control.cycles - before == max(3, round(SETTLE * rate_hz)) + 1

@@ -194,6 +194,29 @@ def test_a_goal_that_is_being_planned_when_another_acquires_it_does_not_begin(us
     assert [answer.code for answer in rig.answers if isinstance(answer, Refused)][-1] is RefusalCode.LEASED
 
 
+@pytest.mark.parametrize("ending", ["released", "silent", "taken over"])
+def test_goals_that_have_not_begun_when_the_lease_of_their_user_ends_never_begin(ending: str) -> None:
+    rig = ControlRig(delay=20)
+    rig.enable()
+    users = Users(rig)
+    users.tell("bob", "acquire", "l")
+    if ending == "silent":
+        rig.cycles(HELD - 5)
+    now_ns = round(rig.now * 1e9)
+    for number in range(2):
+        rig.control.handle(GoalRequest(number, "bob", f"g{number}", FAR, now_ns), now_ns)
+    rig.cycle()  # the planner has the first, the second waits
+    if ending == "taken over":
+        users.tell("ann", "acquire", "m", force=True)
+    elif ending == "released":
+        users.tell("bob", "release", "l")
+    rig.until(lambda: rig.control.lease.user != "bob", 10)
+    rig.cycles(100)
+    assert begun(rig) == []
+    outcome = "rejected" if ending == "taken over" else "stopped"
+    assert rig.outcomes() == [("g0", outcome), ("g1", outcome)]
+
+
 def test_a_lease_of_another_client_of_the_same_user_is_not_taken_in_silence(users: Users) -> None:
     users.tell("ann", "acquire", "l")
     for user, holder in (("ann", "another client of the same user"), ("bob", "ann")):
