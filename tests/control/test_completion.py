@@ -125,6 +125,8 @@ def test_power_that_is_left_is_that_of_drives_that_can_move_or_are_silent_after_
 def test_a_reset_is_answered_when_the_drives_had_time_to_leave_their_faults(rate_hz: int) -> None:
     rig = ControlRig(msgspec.structs.replace(CONFIG, loop=msgspec.structs.replace(CONFIG.loop, rate_hz=rate_hz)))
     rig.command("quick_stop")
+    assert rig.control.fault == "quick_stop by ann"
     before = rig.control.cycles
     rig.command("reset")
+    assert rig.control.fault is None
     assert rig.control.cycles - before == max(3, round(SETTLE * rate_hz)) + 1

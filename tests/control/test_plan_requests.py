@@ -124,6 +124,20 @@ def test_a_motion_from_motion_that_comes_too_late_is_asked_for_anew_with_more_ti
     assert_within_limits(rig)
 
 
+def test_goals_that_have_not_begun_end_in_the_cycle_of_a_stop() -> None:
+    for name in (name for name in Command if name.stops):
+        rig = ControlRig(delay=20)
+        rig.enable()
+        for number in range(2):
+            rig.post(f"g{number}", PoseGoal(0.05, 0.0, 0.0))
+        rig.order(name)
+        outcome = "faulted" if name is Command.QUICK_STOP else "stopped"
+        assert rig.outcomes() == [("g0", outcome), ("g1", outcome)]
+        rig.cycles(50)
+        assert [answer.code for answer in rig.answers if isinstance(answer, Refused)] == [outcome, outcome]
+        assert not any(isinstance(answer, Accepted) for answer in rig.answers)
+
+
 def test_a_planner_that_is_always_late_is_asked_three_times(rig: ControlRig, meddler: Meddler) -> None:
     moving(rig)
     meddler.asked.clear()

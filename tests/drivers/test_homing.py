@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from canopen.profiles.p402 import BaseNode402
 from conftest import Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
+from control.test_plan_requests import Meddler
 from control_rig import CONFIG
 from drivers.test_foreign import MAKES
 from edsfiles import make_eds
@@ -28,6 +29,7 @@ from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
 from trirail.wire.event_codes import EventCode, coded
+from trirail.wire.goals import PoseGoal
 from trirail.wire.packets import Accepted, CommandDone, CommandRequest
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import config
@@ -581,6 +583,19 @@ def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -
     # Those of this cycle, of the two SYNCs before it, and of the one at which the drive's place was read.
     assert len(set(held[since - 4 :])) == 1
     assert held[since - 5] != held[since - 4]
+
+
+def test_goals_that_have_not_begun_are_stopped_by_homing(rig: Rig) -> None:
+    """They would begin from another place than they were meant to."""
+    rig.enable()
+    is_homed(rig)
+    Meddler(rig).delays = [50]
+    for number in range(2):
+        rig.post(f"g{number}", PoseGoal(0.01, 0.0, 0.0))
+    begin(rig)
+    assert rig.outcomes() == [("g0", "stopped"), ("g1", "stopped")]
+    rig.until(rig.holds, 20_000)
+    assert rig.outcomes() == [("g0", "stopped"), ("g1", "stopped")]
 
 
 def test_after_a_stop_no_other_drive_is_begun(rig: Rig) -> None:

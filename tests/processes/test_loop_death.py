@@ -31,6 +31,7 @@ def ended(seq: int, goal_id: str) -> EventReport:
 def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
     clock = Clock()
     words = LoopDeath(0.001, alive, clock)
+    clock.now += 60.0
     words.record_activity()
     words.follow(ended(7, "before"))
     words.follow(ControlInput(1, 3, 0, request("g-1")))
@@ -90,5 +91,6 @@ def test_every_goal_ends_once(history: list[tuple[str, str]]) -> None:
         else:
             words.follow(request(name) if what == "asked" else Status(name, 1.0, None))
             begun.add(name)
+    assert {name for name in "abcd" if words.is_open(name)} == begun - over
     said = [event.id for event in words.events(1) if event.outcome]
     assert sorted(filter(None, said)) == sorted(begun - over)
