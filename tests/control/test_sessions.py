@@ -168,7 +168,7 @@ def quickest(session: Session) -> float:
     scaling, pose = SCALING, session.control.commanded.pose
     times = [run.end_time - run.time]
     for share in 0.97 ** np.arange(100.0):
-        law = scaling.ramp(run.law_state, 0.0, float(share))
+        law = scaling.ramp(run.law_state, 0.0, scaling.full_speed.scaled(float(share)))
         if law is None:
             continue
         until = scaling.last_new_time(run, law, 0.0)

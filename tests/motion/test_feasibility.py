@@ -128,11 +128,13 @@ def test_what_plans_may_use_of_the_sliders_limits() -> None:
     assert CHECKER.slider_limits == pytest.approx(expected)
 
 
-def test_what_plans_and_changes_of_rate_may_use_of_the_platforms_limits() -> None:
+def test_what_plans_and_changes_of_rate_may_use_of_the_limits() -> None:
     limits = np.array([PLATFORM.velocity, PLATFORM.acceleration, PLATFORM.jerk]).T
     assert CHECKER.platform_limits == pytest.approx(limits * PLANS[1:4])
     assert CHECKER.centre_limits == pytest.approx(limits[:2] * PLANS[4:])
-    assert CHECKER.law_limits == pytest.approx(limits * CHANGES[1:4])
+    slider = LIMITS.slider
+    sliders = np.array([slider.velocities, slider.accelerations, slider.jerks]).T
+    assert CHECKER.law_limits == pytest.approx(np.concatenate([limits * CHANGES[1:4], sliders * CHANGES[0]]))
     assert (PLANS < CHANGES).all()
     assert (CHANGES < 1.0).all()
 

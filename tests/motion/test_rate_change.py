@@ -6,15 +6,23 @@ from collections import deque
 
 import numpy as np
 import pytest
-from control_rig import CONFIG
+from control.test_control import assert_within_limits
+from control_rig import CONFIG, ControlRig
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from motion.test_runs import HERE, run_of, way
 from motion.test_time_scaling import SCALING
+from msgspec.structs import replace
+from trirail.config import Config, corrected_geometry
+from trirail.kinematics.robot import inverse
 from trirail.motion.feasibility import PLATFORM_PLAN_SHARES
 from trirail.motion.paths import Path
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.rate_change import RateChange
-from trirail.motion.runs import Run, rest, stretched
+from trirail.motion.runs import MotionState, Run, rest, stretched
 from trirail.motion.schedule import Schedule
+from trirail.wire.goals import PoseGoal, VelocityGoal
+from trirail.wire.packets import Accepted
 
 PERIOD = CONFIG.period
 FAR = (0.1, 0.0, 0.0)
@@ -105,3 +113,64 @@ def test_a_stop_that_is_asked_for_again_and_again_is_no_later() -> None:
             if again:
                 change = RateChange(SCALING, schedule, 0.0, PERIOD)
     assert taken[1] <= taken[0] + 3
+
+
+# ---------------------------------------------------------------------- a stop is as quick as the speed allows
+
+
+def of_velocities(factor: float) -> Config:
+    """The robot with other velocity limits of the platform, which a motion need not be able to reach."""
+    x, y, phi = (factor * velocity for velocity in CONFIG.limits.platform.velocity)
+    platform = replace(CONFIG.limits.platform, velocity=(x, y, phi))
+    return replace(CONFIG, limits=replace(CONFIG.limits, platform=platform))
+
+
+def plain_stop(config: Config, motion: MotionState) -> float:
+    """The longest stop with constant jerk of a platform coordinate or a slider from its present speed [s]."""
+    platform, slider = config.limits.platform, config.limits.slider
+    geometry = corrected_geometry(config)
+    sliders = inverse(geometry, motion.pose, motion.velocity, motion.acceleration).velocity
+    speeds = np.abs([*motion.velocity, *sliders])
+    accelerations = np.array([*platform.acceleration, *slider.accelerations])
+    jerks = np.array([*platform.jerk, *slider.jerks])
+    longs = speeds / accelerations + accelerations / jerks
+    return float(np.where(speeds > accelerations**2 / jerks, longs, 2.0 * np.sqrt(speeds / jerks)).max())
+
+
+@settings(max_examples=30)
+@given(
+    factor=st.sampled_from([1.0, 10.0, 400.0]),
+    share=st.floats(-3.0, -0.5).map(lambda power: 10.0**power),
+    direction=st.tuples(*3 * [st.floats(-1.0, 1.0)]).filter(lambda way: max(map(abs, way)) > 0.5),
+    command=st.sampled_from(["stop", "pause"]),
+)
+def test_a_stop_takes_no_longer_than_the_speed_of_the_motion_needs(
+    factor: float, share: float, direction: tuple[float, float, float], command: str
+) -> None:
+    """Whatever the robot's velocity limits are, and however slow one of its coordinates is."""
+    config = of_velocities(factor)
+    rig = ControlRig(config)
+    rig.enable()
+    most = CONFIG.limits.platform.velocity
+    x, y, phi = (share * way * limit for way, limit in zip(direction, most, strict=True))
+    assert isinstance(rig.send("jog", VelocityGoal(x, y, phi, timeout=10.0)), Accepted)
+    rig.cycles(300)
+    least = plain_stop(config, rig.control.commanded)
+    rig.order(command)
+    took = rig.until(lambda: rig.control.commanded.at_rest) * PERIOD
+    assert took <= 1.2 * least + 5 * PERIOD
+    assert_within_limits(rig)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 700), st.sampled_from([1.0, 400.0]), st.floats(0.02, 1.0))
+def test_a_move_can_be_stopped_at_any_time_whatever_the_velocity_limits_are(
+    begun_for: int, factor: float, speed: float
+) -> None:
+    rig = ControlRig(of_velocities(factor))
+    rig.enable()
+    assert isinstance(rig.send("move", PoseGoal(0.05, 0.02, 0.2, speed=speed)), Accepted)
+    rig.cycles(begun_for)
+    rig.order("stop")
+    assert rig.until(rig.holds) * PERIOD <= 0.4
+    assert_within_limits(rig)

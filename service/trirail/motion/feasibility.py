@@ -160,8 +160,8 @@ class Checker:
         self.centre_limits = planned[4:]
         """Limits of the platform's centre in x and y for planned paths that move another point of the platform (2,
         3)."""
-        self.law_limits = each[1:4] * PLATFORM_LAW_SHARES
-        """Limits of the platform during a change of the rate; rows are x, y, phi (3, 3)."""
+        self.law_limits = np.concatenate([each[1:4] * PLATFORM_LAW_SHARES, sliders.T * SLIDER_LAW_SHARES])
+        """Limits during a change of the rate; rows are the platform's x, y, phi, and the sliders (6, 3)."""
         self._planned = planned * ROUNDING_FACTOR
         self._laws = each * [SLIDER_LAW_SHARES, *[PLATFORM_LAW_SHARES] * 5] / planned
         self._legs = geometry.packed()

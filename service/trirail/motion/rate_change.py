@@ -7,6 +7,7 @@ on any other process.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from trirail.motion.feasibility import SUBJECTS, SampleResult, parts
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run, arrival_time
 from trirail.motion.schedule import Schedule
-from trirail.motion.time_scaling import CHANGE_SHARES, TimeScaling, greatest_rate
+from trirail.motion.time_scaling import CHANGE_SHARES, Quickness, TimeScaling, greatest_rate
 
 MIN_SAMPLES_PER_CYCLE = 40
 """Least number of samples in and next to pieces of a path that are taken in one cycle."""
@@ -77,6 +78,9 @@ class RateChange:
         self._scaling = scaling
         self._schedule = schedule
         self._period = period
+        self._tries: Iterator[Quickness] = iter(())
+        self._quick: Quickness | None = None
+        """Quickness of the change that is tried now; None if the next one is due."""
         self._samples = max(MIN_SAMPLES_PER_CYCLE, int(SAMPLES_PER_SECOND * period))
         self._restart()
 
@@ -123,9 +127,11 @@ class RateChange:
         schedule = self._schedule
         self._motion_key = schedule.version, len(schedule.runs)
         self._possible = self.rate
-        self._share = 0
+        self._begin_search()
         self._excesses = iter((math.inf,) if self._stops else OWN_EXCESSES)
         self._excess = next(self._excesses)
+        self._searched = False
+        """Whether all changes have been tried with the present excess."""
         self._candidate: _Candidate | None = None
         self._unsampled: list[_Part] | None = None
         self._first_s = 0.0
@@ -158,7 +164,7 @@ class RateChange:
             self._candidate = self._propose(run)
         candidate = self._candidate
         if candidate is None:
-            self._next_share()
+            self._quick = None
             return
         if candidate.ahead:
             path, first, until, own = candidate.ahead.pop()
@@ -166,7 +172,7 @@ class RateChange:
             allowed = own * self._excess if own is not None else None
             result = self._scaling.sample(path, candidate.law, first, until, pose, allowed)
             if not result.within_limits:
-                self._next_share()
+                self._candidate = self._quick = None
                 return
         if not candidate.ahead and candidate.begins == cycle:
             self._change_law(run, candidate.law)
@@ -193,10 +199,20 @@ class RateChange:
                 sampled += [_Part(path, *each, limits) for each in parts(path, law, first, until, self._samples)]
         return sampled
 
-    def _next_share(self) -> None:
-        self._candidate, self._share = None, (self._share + 1) % len(CHANGE_SHARES)
-        if self._share == 0 and self.lowers_rate:
-            self._excess = next(self._excesses, math.inf)
+    def _begin_search(self) -> None:
+        """Try the quickest change next."""
+        self._tries, self._quick = iter(()), None
+
+    def _next_try(self, run: Run) -> Quickness:
+        """Return the quickness of the change to try next. After the last, begin again with the quickest."""
+        quick = next(self._tries, None)
+        if quick is None:
+            if self._searched and self.lowers_rate:
+                self._excess = next(self._excesses, math.inf)
+            motion = self._schedule.commanded
+            self._tries = self._scaling.tries(run.law_state, self._possible, motion, CHANGE_SHARES)
+            self._searched, quick = True, next(self._tries)
+        return quick
 
     def _is_prompt(self, law: Path) -> bool:
         """Return whether a change to a lower rate takes at most PROMPTNESS times as long as a stop within own limits.
@@ -212,14 +228,15 @@ class RateChange:
         return float(law.knots[-2]) <= PROMPTNESS * float(stop.max()) + MIN_STOP_S
 
     def _propose(self, run: Run) -> _Candidate | None:
-        """Return a law at the current fraction of the quickest change; None if there is no suitable law.
+        """Return the law to try next; None if it is not suitable.
 
         The law begins late enough for all of its parts to be sampled before.
         """
         cycles = 1
+        quick = self._quick = self._quick or self._next_try(run)
         for _ in range(MAX_POSTPONEMENTS):
             at = run.law_state if cycles == 1 else run.law_state_at(run.time + (cycles - 1) * self._period)
-            law = self._scaling.ramp(at, self._possible, CHANGE_SHARES[self._share])
+            law = self._scaling.ramp(at, self._possible, quick)
             if law is None or (self.applied and not self._ends_sooner(run, law, cycles)):
                 return None
             if not self._is_prompt(law):
@@ -235,11 +252,11 @@ class RateChange:
         present = min(run.end_time, float(run.law.knots[-2])) - run.time
         if (cycles - 1) * self._period + float(law.knots[-2]) <= present - self._period:
             return True
-        self._share = -1  # slower changes would not end earlier either: try the quickest change next
+        self._begin_search()  # slower changes would not end earlier either: try the quickest change next
         return False
 
     def _change_law(self, run: Run, law: Path) -> None:
         self._schedule.change_law(run, law, self._possible)
         self.applied = True
-        seen = self._schedule.version, len(self._schedule.runs)
-        self._motion_key, self._candidate, self._share = seen, None, 0
+        self._motion_key, self._candidate = (self._schedule.version, len(self._schedule.runs)), None
+        self._begin_search()

@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
+import numpy as np
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.robot import inverse_into
 from trirail.motion.feasibility import Checker, SampleResult
 from trirail.motion.paths import Path, constant_law, law_falls
 from trirail.motion.ruckig_call import try_solve
-from trirail.motion.runs import LawState, Run, arrival_time, law_from_ruckig
+from trirail.motion.runs import LawState, MotionState, Run, arrival_time, law_from_ruckig
 
 FINE_RATIO, COARSE_RATIO = 0.88, 0.6
 CHANGE_SHARES = (*(FINE_RATIO**k for k in range(12)), *(FINE_RATIO**11 * COARSE_RATIO**k for k in range(1, 9)))
-"""Fractions of the quickest change of rate, which are tried in turn. A smaller fraction gives a longer stop. The steps
-between the fractions are fine for quick stops. They are coarse for long stops, which only robots with low slider limits
-need."""
+"""Fractions of the quickest change of rate at full speed, which are tried in turn. A smaller fraction gives a longer
+stop. The steps between the fractions are fine for quick stops. They are coarse for long stops, which only robots with
+low slider limits need."""
+
+
+class Quickness(NamedTuple):
+    """Greatest first and second derivative of the rate of the time along a path during a change [1/s, 1/s²]."""
+
+    change: float
+    jerk: float
+
+    def scaled(self, share: float) -> Quickness:
+        """Return a fraction of this quickness."""
+        return Quickness(share * self.change, share * self.jerk)
 
 
 class TimeScaling:
@@ -29,11 +43,10 @@ class TimeScaling:
         self._checker = checker
         self._period = period
         self._ruckig = Ruckig(1)
-        velocity, acceleration, jerk = checker.law_limits.T
-        # First and second derivative of the rate at which a motion at full speed reaches the platform's limits
-        # [1/s, 1/s²].
-        self._change = float((acceleration / velocity).min())
-        self._change_jerk = float((jerk / velocity).min())
+        self._limits = checker.law_limits.T
+        velocity, acceleration, jerk = self._limits[:, :3]
+        self.full_speed = Quickness(float((acceleration / velocity).min()), float((jerk / velocity).min()))
+        """Quickness with which a motion at full speed reaches the platform's limits."""
 
     def start_run(self, path: Path, rate: float, pose: Sequence[float]) -> Run:
         """Return a run along a path at a constant rate. A rate that exceeds the limits is lowered."""
@@ -46,19 +59,31 @@ class TimeScaling:
             rate if rate <= 1.0 else greatest_rate(rate, self.sample(path, constant_law(1.0), 0.0, path.duration, pose))
         )
 
-    def stop(self, run: Run, pose: Sequence[float], shares: Sequence[float]) -> Path | None:
+    def stop(self, run: Run, motion: MotionState, shares: Sequence[float]) -> Path | None:
         """Return a law that stops a run within the limits; None if there is none.
 
-        `shares` are fractions of the quickest stop, which are tried in turn.
+        `motion` is the present motion of the platform, and `shares` are as in `tries`.
         """
-        for share in shares:
-            law = self.ramp(run.law_state, 0.0, share)
+        for quick in self.tries(run.law_state, 0.0, motion, shares):
+            law = self.ramp(run.law_state, 0.0, quick)
             if (
                 law is not None
-                and self.sample(run.path, law, 0.0, self.last_new_time(run, law, 0.0), pose).within_limits
+                and self.sample(run.path, law, 0.0, self.last_new_time(run, law, 0.0), motion.pose).within_limits
             ):
                 return law
         return None
+
+    def tries(self, at: LawState, rate: float, motion: MotionState, shares: Sequence[float]) -> Iterator[Quickness]:
+        """Yield the quickness of each change of rate to try in turn: first as quick as the present speed allows.
+
+        `shares` are fractions of the quickest change at full speed, which are yielded last.
+        """
+        full = self.full_speed
+        quick = self._present_speed(at.rate, motion) if rate < at.rate else None
+        while quick is not None and (quick.change > full.change or quick.jerk > full.jerk):
+            yield Quickness(max(quick.change, full.change), max(quick.jerk, full.jerk))
+            quick = quick.scaled(COARSE_RATIO)
+        yield from map(full.scaled, shares)
 
     def last_new_time(self, run: Run, law: Path, rate: float) -> float:
         """Return the time until which a law must be sampled [s]. Later, the rate is constant or the path is over."""
@@ -70,23 +95,39 @@ class TimeScaling:
         """Sample a path under a law; see Checker.sample."""
         return self._checker.sample(path, law, first, until, pose, own)
 
-    def ramp(self, at: LawState, rate: float, share: float) -> Path | None:
+    def ramp(self, at: LawState, rate: float, quick: Quickness) -> Path | None:
         """Return a law from the state `at` to a rate; None if there is none.
 
-        `share` is the fraction of the quickest change. If the rate is already falling, a small fraction may not be
-        enough to prevent the rate from becoming negative. In this case, there is no law.
+        If the rate is already falling, a change that is not quick may not be enough to prevent the rate from becoming
+        negative. In this case, there is no law.
         """
         request = InputParameter(1)
         request.control_interface = ControlInterface.Velocity
         request.current_position, request.current_velocity = [at.s], [at.rate]
         request.current_acceleration, request.target_velocity = [at.change], [rate]
-        request.max_acceleration = [max(share * self._change, abs(at.change))]
-        request.max_jerk = [share * self._change_jerk]
+        request.max_acceleration = [max(quick.change, abs(at.change))]
+        request.max_jerk = [quick.jerk]
         trajectory = Trajectory(1)
         if not try_solve(self._ruckig, request, trajectory):
             return None
         law = law_from_ruckig(trajectory, rate)
         return None if law_falls(law.knots, law.pieces) else law
+
+    def _present_speed(self, rate: float, motion: MotionState) -> Quickness | None:
+        """Return the quickness with which a motion that is now at `rate` reaches the limits of sliders and platform.
+
+        It is for the speed that remains when the present acceleration has been ended with the greatest jerk. Return
+        None if the robot is singular.
+        """
+        rows = np.zeros((6, 3))
+        if inverse_into(self._legs, np.array(motion, dtype=np.float64), rows):
+            return None
+        _, greatest, jerk = self._limits
+        velocity, acceleration = (np.abs((motion[k], rows[k])).ravel() for k in (1, 2))
+        speed = velocity + acceleration**2 / (2.0 * jerk)
+        # A stop takes at least two periods.
+        speed = np.maximum(speed, np.minimum(jerk * self._period, greatest) * self._period) / rate
+        return Quickness(float((greatest / speed).min()), float((jerk / speed).min()))
 
 
 def greatest_rate(rate: float, result: SampleResult) -> float:
