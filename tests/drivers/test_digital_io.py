@@ -493,6 +493,84 @@ def test_inputs_have_a_pdo_of_their_own_where_the_statusword_has_none(closing: C
     assert rig.cycle(rig.feedback.position).inputs == (PART, 0, 0)
 
 
+LATE_INPUTS = {
+    "inhibit time": {(0x1800, 3): 1000, (0x1802, 3): 1000},
+    "event timer of their own PDO": {(0x1800, 3): 1000, (0x1802, 5): 0},
+    "event timer of the statusword's PDO": {(0x1800, 5): 0},
+}
+"""Values that a drive keeps, with which its inputs come late, or a lost frame of theirs is not repeated."""
+
+
+def with_inputs(values: dict[tuple[int, int], int]) -> ForeignRig:
+    """Drives that keep these values, of which A has an input that the robot uses."""
+    return ForeignRig(
+        "elmo_gold", Habits(values=values, access=dict.fromkeys(values, "ro")), io=(DigitalIo(inputs=PART), *NO_IO[1:])
+    )
+
+
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize("case", LATE_INPUTS)
+def test_inputs_whose_pdo_is_late_or_not_repeated_are_requested_by_sdo(
+    closing: Closing, monkeypatch: pytest.MonkeyPatch, case: str, lost: bool
+) -> None:
+    """No edge is lost, also where every frame of their PDO is."""
+    rig = closing(with_inputs(LATE_INPUTS[case]))
+    rig.ready()
+    a = rig.nodes[0]
+    identifier, send = rig.drives._axes[0].exchange.inputs, a._send
+    monkeypatch.setattr(a, "_send", lambda can_id, data: None if lost and can_id == identifier else send(can_id, data))
+    longest = round(canopen_frames.POLL_PERIOD / rig.period) + 3
+    for pressed in (PART, 0) * 10:
+        a.put(0x60FD, pressed)
+        seen = [rig.cycle(rig.feedback.position) for _ in range(longest)]
+        assert seen[-1].fault is None, seen[-1].fault
+        assert seen[-1].inputs[0] == pressed
+        edges = [one.inputs[0] != other.inputs[0] for one, other in itertools.pairwise(seen)]
+        assert sum(edges) <= 1
+    assert not rig.drives.prepare_tables(), "compiled cycles send no requests"
+
+
+@pytest.mark.parametrize("case", LATE_INPUTS)
+def test_the_log_says_how_late_inputs_may_be_and_what_to_set(closing: Closing, case: str) -> None:
+    rig = closing(with_inputs(LATE_INPUTS[case]))
+    rig.ready()
+    (told,) = [warning for warning in rig.warnings if "digital inputs" in warning]
+    index = 0x1800 if (0x1800, 5) in LATE_INPUTS[case] else 0x1802
+    assert "may be 20 ms late" in told
+    assert "also requested by SDO" in told
+    assert f"{index:04X}:03" in told
+    assert not any("statusword" in warning and "1802" in warning for warning in rig.warnings)
+
+
+def test_inputs_with_a_short_inhibit_time_are_not_requested_by_sdo(closing: Closing) -> None:
+    rig = closing(with_inputs({(0x1800, 3): 50, (0x1802, 3): 50}))
+    rig.ready()
+    (told,) = [warning for warning in rig.warnings if "digital inputs" in warning]
+    assert "may be 5 ms late" in told
+    assert "SDO" not in told
+    rig.cycles(50, rig.feedback.position)
+    assert not any(message.data[1:3] == b"\xfd\x60" for message in rig.wires.sent[-150:])
+
+
+def test_an_answer_by_sdo_does_not_replace_inputs_that_a_pdo_has_brought_since_it_was_requested(
+    closing: Closing,
+) -> None:
+    rig = closing(with_inputs(LATE_INPUTS["inhibit time"]))
+    rig.ready()
+    axis, now = rig.drives._axes[0], rig.clock.now
+    answer = b"\x43\xfd\x60\x00" + bytes(4)
+    axis.note_request(now, canopen_frames.INPUTS_UPLOAD)
+    axis.on_inputs(canopen_frames.INPUTS.pack(PART), now)
+    axis.on_sdo(answer, now)
+    axis.update_inputs()
+    assert axis.inputs == PART
+    axis.note_feedback()
+    axis.note_request(now, canopen_frames.INPUTS_UPLOAD)
+    axis.on_sdo(answer, now)
+    axis.update_inputs()
+    assert axis.inputs == 0
+
+
 # ---------------------------------------------------------------------- drives that miss outputs
 
 

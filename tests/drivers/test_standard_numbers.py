@@ -59,6 +59,10 @@ CANOPEN: dict[str, dict[str, object]] = {
         "OUTPUTS_DOWNLOAD": bytes.fromhex("23fe6001"),
         "OUTPUTS_REFUSED": bytes.fromhex("80fe6001"),
     },
+    "CiA 301, 7.2.4 SDO: expedited with four bytes; CiA 402-2 digital inputs 60FDh": {
+        "INPUTS_UPLOAD": bytes.fromhex("40fd600000000000"),
+        "INPUTS_UPLOADED": bytes.fromhex("43fd6000"),
+    },
     "CiA 402-2, types of 60FDh and 60FEh:01": {"INPUTS": "<I", "OUTPUTS": "<I"},
     "CiA 301, 7.2.4 SDO: expedited with one byte; CiA 402-2 modes of operation display 6061h": {
         "MODE_DISPLAY_UPLOAD": bytes.fromhex("4061600000000000"),

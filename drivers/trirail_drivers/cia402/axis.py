@@ -28,7 +28,7 @@ FOLLOW_TIME = STATUS_WITHIN
 REGISTER_TIME = 0.5
 """Longest time until a drive reports its error register after a reset [s]."""
 SUPERVISED_ANSWER_TIME = canopen_frames.STATUS_PERIOD / 2
-"""Like ANSWER_TIME, of a drive whose statusword is requested by SDO [s]."""
+"""Like ANSWER_TIME, of a drive whose statusword or inputs are requested by SDO [s]."""
 ANSWER_TIME = 0.5
 """Longest time until a drive answers an SDO request from the cycle [s]. A set-up waits this long before it starts."""
 STANDSTILL_DISTANCE_M = 2e-5
@@ -43,7 +43,7 @@ RESET_TIME = 2 * canopen_frames.STATUS_PERIOD
 
 _RESTARTED = "has restarted and lost its set-up: wait until the drive is configured again, then send reset"
 _NMT_STATES = {canopen_frames.STOPPED: "stopped", canopen_frames.PRE_OPERATIONAL: "pre-operational"}
-_POLLS = (canopen_frames.STATUSWORD_UPLOAD, canopen_frames.MODE_DISPLAY_UPLOAD)
+_POLLS = (canopen_frames.STATUSWORD_UPLOAD, canopen_frames.MODE_DISPLAY_UPLOAD, canopen_frames.INPUTS_UPLOAD)
 _STATE_BITS = 0x6F
 """Bits of a statusword that encode the state."""
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
@@ -61,6 +61,10 @@ class Cia402Axis(Axis):
     """Newest digital inputs."""
     _changed_inputs = 0
     """Inputs whose change will be in the next feedback; their later changes will be in the feedback after it."""
+    _inputs_overtaken = False
+    """Whether the inputs have arrived by PDO since they were last requested by SDO, as `_overtaken`."""
+    inputs_due = -math.inf
+    """Time of the next SDO request for the inputs [s], if they are polled."""
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
@@ -151,10 +155,13 @@ class Cia402Axis(Axis):
         """Record an SDO request."""
         if request == canopen_frames.STATUSWORD_UPLOAD:
             self._statusword_asked, self._overtaken = True, False
+        elif request == canopen_frames.INPUTS_UPLOAD:
+            self._inputs_overtaken = False
         if self.unanswered:  # the drive may lose the earlier request
             self.word_by_sdo, self.outputs_sent = None, NOTHING_SENT
         # Until an answer is counted as lost, no statusword is requested; a few lost answers must not become a fault.
-        supervises = (request in _POLLS or self.exchange.polled) and not self.left_operational
+        polled = self.exchange.polled or self.exchange.inputs_polled
+        supervises = (request in _POLLS or polled) and not self.left_operational
         self._pending.begin(now, request, SUPERVISED_ANSWER_TIME if supervises else ANSWER_TIME)
 
     @property
@@ -228,7 +235,8 @@ class Cia402Axis(Axis):
         lives = self._operational and not (
             self.stopped or self.left_operational or self.status_wanted or self.register_wanted
         )
-        asked = self.sdo_asked is not None or self.exchange.polled or self.awaits_mode
+        polled = self.exchange.polled or self.exchange.inputs_polled
+        asked = self.sdo_asked is not None or polled or self.awaits_mode
         follows = wanted is PowerState.OPERATION_ENABLED and self.exchange.tells_following
         quiet = self._answers_after.idle and self._answers_per_sync.is_clear and self._unfollowed_since is None
         return (
@@ -287,6 +295,10 @@ class Cia402Axis(Axis):
                 self._on_statusword(data[4:6], now)
             self._statusword_asked = self._overtaken = False
             self.poll_due = now + canopen_frames.POLL_PERIOD
+        elif canopen_frames.is_upload(data, canopen_frames.INPUTS_UPLOADED):
+            if not self._inputs_overtaken:
+                self.on_inputs(data[4:8], now)
+            self.inputs_due = now + canopen_frames.POLL_PERIOD
         elif data[:4] == canopen_frames.OUTPUTS_REFUSED:
             code = int.from_bytes(data[4:8], "little")
             self.note_fault("state", 0, f"refuses its digital outputs, object 60FE:01 (SDO abort {code:08X})")
@@ -328,8 +340,9 @@ class Cia402Axis(Axis):
         self._on_statusword(data, now)
 
     def on_inputs(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """Handle TPDO3, sent on change and every STATUS_PERIOD: the digital inputs."""
+        """Handle TPDO3, sent on change and every STATUS_PERIOD, or an SDO answer: the digital inputs."""
         (inputs,) = canopen_frames.INPUTS.unpack(data)
+        self._inputs_overtaken = True
         self.update_inputs()
         self._received_inputs = inputs & self.io.inputs
 

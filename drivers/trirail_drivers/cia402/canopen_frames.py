@@ -60,6 +60,10 @@ MODE_DISPLAY_UPLOADED: Final = b"\x4f\x61\x60\x00"
 """First bytes of the SDO answer with the mode display; the mode's byte follows."""
 STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"
 """First bytes of the SDO answer with the statusword; its two bytes follow."""
+INPUTS_UPLOAD: Final = b"\x40\xfd\x60\x00" + bytes(4)
+"""SDO request for the digital inputs 60FDh."""
+INPUTS_UPLOADED: Final = b"\x43\xfd\x60\x00"
+"""First bytes of the SDO answer with the digital inputs; their four bytes follow."""
 _UPLOAD_BITS: Final = 0xE2
 """Bits of the first byte of an SDO answer that contain the command specifier, and whether the upload is expedited."""
 
@@ -88,7 +92,7 @@ STATUS_PERIOD: Final = 0.1
 """Period in which a drive repeats an unchanged statusword: event timer 1800h:05 [s]."""
 
 POLL_PERIOD: Final = 0.02
-"""Period of the SDO requests for a statusword that the drive does not repeat in a PDO [s]."""
+"""Period of the SDO requests for a statusword or inputs that no PDO repeats [s]."""
 INTERPOLATE: Final = 0x10
 """Controlword bit 4, which enables interpolated position mode; sent together with ENABLE_OPERATION."""
 REMOTE: Final = 1 << 9

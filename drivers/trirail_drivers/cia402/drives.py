@@ -260,8 +260,12 @@ class Cia402(Driver[Cia402Axis]):
             axis.update_inputs()
         now = self._clock()
         for axis in self._axes:  # neither an EMCY nor an NMT state shows whether a drive has power
-            if now >= axis.poll_due and axis.accepts_request(now):
+            if not axis.accepts_request(now):
+                continue
+            if now >= axis.poll_due:
                 self._ask(axis, canopen_frames.STATUSWORD_UPLOAD)
+            elif axis.exchange.inputs_polled and now >= axis.inputs_due:
+                self._ask(axis, canopen_frames.INPUTS_UPLOAD)
         return self._feedback()
 
     def _feedback(self, warnings: tuple[str, ...] = ()) -> Feedback:
@@ -479,6 +483,8 @@ class Cia402(Driver[Cia402Axis]):
             if axis.status_wanted or ((axis.exchange.polled or axis.awaits_mode) and now >= axis.poll_due):
                 self._ask(axis, axis.request())
                 axis.status_wanted = False
+            elif axis.exchange.inputs_polled and now >= axis.inputs_due and axis.configured:
+                self._ask(axis, canopen_frames.INPUTS_UPLOAD)
 
     def _command(self) -> None:
         """Send the controlwords that are due, one transition per drive at a time."""

@@ -66,10 +66,8 @@ USES: Final = {
         (_P, "only its reaction 6007"),
     ),
     "1400:05": ObjectUse(_R, "Event timer", "no deadline for controlwords", "there is none"),
-    "1800:03": ObjectUse(
-        _R, "Inhibit time", "a statusword without delay", "there is none", (_R, "delayed statuswords")
-    ),
-    "1800:05": ObjectUse(_R, "Event timer", "repeated statuswords", "beside the position, or polled"),
+    "1800:03": ObjectUse(_R, "Inhibit time", "changes without delay", "there is none", (_R, "changes come late")),
+    "1800:05": ObjectUse(_R, "Event timer", "repeated values", "beside the position, or polled"),
     "6007": ObjectUse(_P, "Abort connection option code", "its stop without a master", "its own reaction"),
     "603F": ObjectUse(_R, "Error code", "the cause of a fault at the start", "only its EMCY shows it"),
     "6040": ObjectUse(_N, "Controlword", "power, stop, reset", "refused"),

@@ -162,7 +162,7 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
     setpoints, controlword = await pdos.setpoints(mode, velocity_offset=one.velocity_offset)
     if setpoints.has_velocity:
         await check_polarity(remote)
-    feedback, status, polled, inputs = await pdos.feedback(inputs=bool(one.io.inputs))
+    feedback, status, polled, inputs, inputs_polled = await pdos.feedback(inputs=bool(one.io.inputs))
     outputs = await pdos.outputs() if one.io.outputs else None
     unused_rpdos, unused_tpdos = await pdos.switch_off_others()
     for key in ((0x603F, 0), (0x1001, 0)):
@@ -185,6 +185,7 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
         outputs,
         kept,
         inputs,
+        inputs_polled,
         unused_rpdos,
         unused_tpdos,
     )

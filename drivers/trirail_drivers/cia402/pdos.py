@@ -168,29 +168,49 @@ class Pdos:
             self._drive.add_note("its digital outputs are written by SDO, since no RPDO takes 60FE:01: not on a path")
         return None if pdo is None else pdo.identifier
 
-    async def feedback(self, *, inputs: bool = False) -> tuple[FeedbackPdo, int | None, bool, int | None]:
+    async def feedback(self, *, inputs: bool = False) -> tuple[FeedbackPdo, int | None, bool, int | None, bool]:
         """Set up the TPDOs of the position, of the statusword and, if `inputs` is True, of the digital inputs.
 
-        Return four values: the SYNC-driven TPDO of the position; the identifier of the TPDO of the statusword, or None;
-        whether the statusword must be polled; and the identifier of the TPDO of the digital inputs, which may be that
-        of the statusword, or None. Raises DriveError if no TPDO can contain the position or the inputs.
+        Return five values: the SYNC-driven TPDO of the position; the identifier of the TPDO of the statusword, or None;
+        whether the statusword must be polled; the identifier of the TPDO of the digital inputs, which may be that of
+        the statusword, or None; and whether the inputs must be polled. Raises DriveError if no TPDO can contain the
+        position or the inputs.
         """
         chosen, status, polled, beside = await self._feedback_and_status(inputs=inputs)
-        if not inputs or beside:
-            return chosen, status, polled, status if beside else None
-        return chosen, status, polled, await self._inputs()
+        if not inputs:
+            return chosen, status, polled, None, False
+        identifier, index = (status, TPDO) if beside else await self._inputs()
+        return chosen, status, polled, identifier, await self._must_poll_inputs(index)
 
-    async def _inputs(self) -> int:
-        """Set up a TPDO with only the digital inputs; return its identifier. Raises DriveError if no TPDO fits."""
+    async def _must_poll_inputs(self, index: int) -> bool:
+        """Whether the digital inputs must be polled, given their TPDO; if they may be late, add a note."""
+        polled = not await self._is_repeated(index)
+        inhibit, timer = [await self._remote.peek(index, subindex) for subindex in (3, 5)]
+        if polled or inhibit:
+            late = canopen_frames.POLL_PERIOD if polled else (inhibit or 0) * INHIBIT_UNIT_S
+            held = ("missing" if time is None else str(time) for time in (inhibit, timer))
+            self._drive.add_note(
+                f"its digital inputs may be {1000 * late:g} ms late, so that a goal with stop_at stops later, and "
+                f"shorter pulses may be lost{'; they are also requested by SDO' if polled else ''}; their inhibit time "
+                f"{index:04X}:03 and event timer {index:04X}:05 are {' and '.join(held)}: set them to 0 and "
+                f"{1000 * canopen_frames.STATUS_PERIOD:g} with the manufacturer's tool, or use inputs of another drive"
+            )
+        return polled
+
+    async def _inputs(self) -> tuple[int, int]:
+        """Set up a TPDO with only the digital inputs; return its identifier, and the index of its parameters.
+
+        Raises DriveError if no TPDO fits.
+        """
         entries, number = (DIGITAL_INPUTS,), canopen_frames.TPDO3 + self._node
         for index in (TPDO + 2, TPDO + 3, TPDO):
             if (
                 index not in self._used
                 and (identifier := await self._map(index, number, ON_CHANGE, entries)) is not None
             ):
-                return identifier
+                return identifier, index
         if (pdo := await self._first_fixed(TPDO, entries, ON_CHANGE)) is not None:
-            return pdo.identifier
+            return pdo.identifier, pdo.at
         raise DriveError(
             f"drive {self._remote.name}: its digital inputs 60FD cannot be mapped into a TPDO; use inputs of another "
             "drive in [inputs]"
@@ -347,8 +367,8 @@ class Pdos:
     async def _set_time(self, writes: _ReversibleWrites, index: int, kind: int, subindex: int, value: int) -> None:
         """Set the event timer or the inhibit time of a PDO.
 
-        If the drive refuses one of a TPDO, the TPDO is used all the same: the statusword is also polled by SDO if it
-        may be late. A TPDO that is sent at SYNC ignores both times (CiA 301).
+        If the drive refuses one of a TPDO, the TPDO is used all the same: the statusword and the inputs are also polled
+        by SDO if they may be late. A TPDO that is sent at SYNC ignores both times (CiA 301).
         """
         try:
             await writes.write(index, subindex, value)
@@ -366,7 +386,7 @@ class Pdos:
     async def _event_timer(self, index: int, kind: int) -> tuple[int, int] | None:
         """Return the subindex and the value of the event timer if it must be changed, otherwise None.
 
-        The event timer of a TPDO repeats the statusword. That of an RPDO is a deadline, and must be off.
+        The event timer of a TPDO repeats the statusword and the inputs. That of an RPDO is a deadline, and must be off.
         """
         if index < TPDO:
             return await self._parameter(index, 5, 0)
@@ -461,7 +481,7 @@ class Pdos:
         return pdo.identifier, not await self._is_repeated(pdo.at), False
 
     async def _is_repeated(self, index: int) -> bool:
-        """Whether the drive sends the statusword's TPDO periodically, often enough, and changes as early as a poll."""
+        """Whether the drive sends an event-driven TPDO periodically, often enough, and changes as early as a poll."""
         period_ms, inhibit = await self._remote.peek(index, 5) or 0, await self._remote.peek(index, 3) or 0
         is_prompt = inhibit <= round(canopen_frames.POLL_PERIOD / INHIBIT_UNIT_S)
         return 0 < period_ms <= round(1000 * canopen_frames.STATUS_PERIOD) and is_prompt

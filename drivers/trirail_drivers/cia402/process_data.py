@@ -150,6 +150,8 @@ class Exchange:
     """Identifier of the event-driven TPDO of the digital inputs, which may be the statusword's TPDO; None if there are
     no inputs.
     """
+    inputs_polled: bool = False
+    """Whether the digital inputs are also requested by SDO, because their PDO may be late or is not repeated."""
     unused_rpdos: frozenset[int] = frozenset()
     """Identifiers of the unused RPDOs that cannot be switched off."""
     unused_tpdos: frozenset[int] = frozenset()
@@ -204,7 +206,7 @@ def traffic(exchanges: Iterable[Exchange]) -> Traffic:
     exchanges = tuple(exchanges)
     repeated = [exchange.status_size for exchange in exchanges if exchange.status]
     repeated += [canopen_frames.INPUTS.size for exchange in exchanges if exchange.inputs not in (None, exchange.status)]
-    polls = 2 * sum(exchange.polled for exchange in exchanges)
+    polls = 2 * sum(exchange.polled + exchange.inputs_polled for exchange in exchanges)
     return Traffic(
         cycle=(0, *(size for exchange in exchanges for size in (exchange.setpoints.size, exchange.feedback.size))),
         periodic=(
@@ -212,7 +214,7 @@ def traffic(exchanges: Iterable[Exchange]) -> Traffic:
             *(polls * ((8, canopen_frames.POLL_PERIOD),)),
         ),
         heartbeats=(1,) * (1 + sum(1 + exchange.guarded for exchange in exchanges)),
-        most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
+        most_sent=11 + sum(exchange.guarded + (exchange.polled or exchange.inputs_polled) for exchange in exchanges),
         output=canopen_frames.TRAFFIC.output,
     ).with_outputs(sum(exchange.outputs is not None for exchange in exchanges))
 
