@@ -12,13 +12,14 @@ import pytest
 from control_rig import CONFIG, ControlRig, PerfectDrives
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, Input, Output, load
+from trirail.control.modes import ModeEvent
 from trirail.control.outputs import LOG_LENGTH, SWITCHED
 from trirail.errors import RefusalCode
-from trirail.wire.event_codes import EventCode
+from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goal_kind import OwnLimits
 from trirail.wire.goals import MoveGoal, PoseGoal
 from trirail.wire.marks import Mark, StopAt, Switch
-from trirail.wire.messages import GoalReply
+from trirail.wire.messages import GoalReply, Outcome
 from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, GoalRequest, Refused, Request
 from trirail.wire.vocabulary import Command, Mode, SetOutput
 
@@ -593,6 +594,31 @@ def test_goals_behind_one_that_ends_at_an_edge_do_not_run(rig: Rig) -> None:
     rig.cycles(500)
     assert sorted(rig.outcomes()) == [("g1", "done"), ("g2", "stopped")]
     assert rig.poses[-1][1] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("how", "outcome"), [("stop", "done"), ("disable", "done"), ("gateway", "done"), ("quick_stop", "faulted")]
+)
+def test_a_goal_that_brakes_at_its_edge_is_done_there_unless_a_fault_ends_it(
+    rig: Rig, how: str, outcome: Outcome
+) -> None:
+    """Its end tells the pose at the edge, also if a stop follows."""
+    rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, stop_at=StopAt("part")))
+    rig.cycles(200)
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.cycles(2)
+    assert not rig.outcomes(), "it brakes"
+    if how == "gateway":
+        rig.control.modes.handle_disturbance(ModeEvent.GATEWAY_LOST, coded("gateway lost", EventCode.GATEWAY_LOST))
+        rig.cycle()
+    else:
+        rig.order(how)
+    (end,) = (notice for notice in rig.notices if notice.kind == "goal")
+    (edge,) = (notice for notice in rig.notices if notice.kind == "input")
+    assert end.outcome == outcome
+    if outcome == "done":
+        assert (end.reason, end.event_code) == ("input part rising", EventCode.INPUT_REACHED)
+        assert end.params["x"] == pytest.approx(edge.params["x"])
 
 
 @pytest.mark.parametrize("paused_for", [1, 2000])

@@ -176,9 +176,7 @@ class Ledger:
         goal, last = request.goal, self.goals[-1] if self.goals else None
         passes = at_end and last is not None and last.blend is not None and goal.follows
         if not plan.reply.queued and not passes:
-            if self.goals and (at_edge := self.goals[0].at_edge) is not None:  # this goal has ended, and only brakes
-                ended = self.goals.popleft()
-                self._end_goal(ended.id, ended.user, ended.kind, "done", at_edge)
+            self.end_at_edge()
             self.end("preempted", coded(f"preempted by goal {request.id}", EventCode.PREEMPTED, goal=request.id))
         begun = ActiveGoal(
             request.id,
@@ -241,6 +239,12 @@ class Ledger:
         """Record that the current goal has ended at the edge of an input, and end the goals that follow it."""
         self.end("stopped", reason, but=1)
         self.goals[0] = self.goals[0]._replace(at_edge=reason)
+
+    def end_at_edge(self) -> None:
+        """End the current goal as done if it only brakes after the edge of its input."""
+        if self.goals and (at_edge := self.goals[0].at_edge) is not None:
+            goal = self.goals.popleft()
+            self._end_goal(goal.id, goal.user, goal.kind, "done", at_edge)
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
         """End a goal that has not begun, and answer the request with a refusal."""

@@ -122,9 +122,9 @@ class Transitions:
             self._schedule.stop_on_path()  # also while the robot brakes; otherwise the next goal could begin
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = EventCode.RELEASED if before.released else EventCode.ARRIVED
-            at_edge = self._ledger.goal.at_edge if self._ledger.goal is not None else None
-            at_end = at_edge or coded(arrived.value, arrived)
-            self._ledger.end(outcome, at_end if outcome == "done" else reason)
+            if outcome != "faulted":
+                self._ledger.end_at_edge()
+            self._ledger.end(outcome, coded(arrived.value, arrived) if outcome == "done" else reason)
         if self.state.mode is not before.mode:
             begun = goal.id if goal is not None else None
             words = f"{self.state.mode}: {reason}"
