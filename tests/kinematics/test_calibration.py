@@ -122,6 +122,21 @@ def test_standard_errors_are_those_of_many_trials_also_if_the_stated_noise_is_to
     assert calibrate.describe(trials[0], range(30)).count(f"{trials[0].misfit:.2f} times the stated noise") == 2
 
 
+def test_standard_errors_contain_the_share_of_combinations_that_stay_open() -> None:
+    """Six poses on a line, accurately measured: four combinations of each leg stay open, with a little of others."""
+    random = np.random.default_rng(1)
+    noise, scores = np.array([1e-6, 1e-6, 5e-6]), []
+    for _ in range(60):
+        true = DOUBT * 0.2 * random.standard_normal((3, 5))
+        seen = poses(random, 6, (0.035, 0.0, 0.0)) + random.uniform(-1.0, 1.0, 3) * [0.04, 0.04, 0.2]
+        sliders = inverse(corrected(START, true), seen).position
+        seen_noisily = seen + noise * random.standard_normal(seen.shape)
+        found = identify(START, seen_noisily, sliders, position_noise=1e-6, angle_noise=5e-6)
+        scores.append((found.corrections - true) / found.standard_errors)
+    assert np.any(np.isinf(found.standard_errors))
+    assert np.abs(scores).max() < 5.0
+
+
 def test_stated_noise_weighs_and_scales() -> None:
     random = np.random.default_rng(2)
     robot, seen = as_built(random), poses(random, 60)

@@ -59,7 +59,8 @@ class Calibration(NamedTuple):
 
     geometry: Geometry
     corrections: Array  # (3, 5), relative to the starting geometry [m, rad]
-    # (3, 5), from the stated noise times max(1, misfit); infinite for undetermined parameters
+    # (3, 5), from the stated noise times max(1, misfit), and from DOUBT for shares of undetermined combinations;
+    # infinite for parameters that are named as undetermined
     standard_errors: Array
     open: tuple[Open, ...]
     residuals: Array  # (N, 3): measured minus computed x, y, phi [m, m, rad]
@@ -84,7 +85,7 @@ def identify(
             raise CalibrationError(f"the {name} noise is {value}: it must be finite and positive")
     _check(start, poses, sliders)
     noise: Array = np.array([position_noise, position_noise, angle_noise])
-    basis, unknown = _separate(start, pose_derivatives(start, start, poses) / noise[:, None, None])
+    basis, undetermined, unknown = _separate(start, pose_derivatives(start, start, poses) / noise[:, None, None])
 
     def geometry(z: Array) -> Geometry:
         return corrected(start, (basis @ z).reshape(3, 5))
@@ -123,9 +124,14 @@ def identify(
             f"no convergence after {solution.nfev} steps: the poses vary too little; vary the poses more, above all in "
             "phi"
         )
-    deviations = (basis @ np.linalg.pinv(solution.jac)).reshape(3, 5, -1)
+    deviations = basis @ np.linalg.pinv(solution.jac)
+    # An undetermined combination is as uncertain as the drawings. It may be a part of a parameter that is not named,
+    # and at the identified geometry it may change what the poses say of the determined combinations.
+    derivatives = pose_derivatives(geometry(solution.x), start, poses) / noise[:, None, None]
+    undetermined += deviations @ derivatives.reshape(poses.size, 15) @ undetermined
     # Residuals above the stated noise show that the noise was stated too low. Residuals below it may be chance.
-    errors = max(1.0, misfit) * np.sqrt(np.sum(deviations**2, axis=2))
+    variances = max(1.0, misfit) ** 2 * np.sum(deviations**2, axis=1) + np.sum(undetermined**2, axis=1)
+    errors = np.sqrt(variances).reshape(3, 5)
     for leg, names, _ in unknown:
         errors[LEGS.index(leg), [start.parameters.index(name) for name in names]] = math.inf
     return Calibration(
@@ -190,30 +196,31 @@ def _residuals(geometry: Geometry, poses: Array, sliders: Array) -> Array:
     return difference
 
 
-def _separate(start: Geometry, derivatives: Array) -> tuple[Array, tuple[Open, ...]]:
+def _separate(start: Geometry, derivatives: Array) -> tuple[Array, Array, tuple[Open, ...]]:
     """Separate the corrections that the data determines from the undetermined corrections.
 
-    `derivatives` are pose_derivatives divided by the noise. Returns a basis (15, K) of the determined corrections, and
-    the parameters of the undetermined corrections. The effects of different legs at each pose are independent, so that
-    a correction of one leg cannot compensate a correction of another leg. Each undetermined combination therefore
-    belongs to a single leg.
+    `derivatives` are pose_derivatives divided by the noise. Returns a basis (15, K) of the determined corrections, the
+    undetermined corrections (15, 15 - K) in the size that drawings allow, and the parameters of the latter. The effects
+    of different legs at each pose are independent, so that a correction of one leg cannot compensate a correction of
+    another leg. Each undetermined combination therefore belongs to a single leg.
     """
-    columns: list[Array] = []
+    determined: list[Array] = []
+    undetermined: list[Array] = []
     unknown: list[Open] = []
     for i, (leg, built) in enumerate(zip(LEGS, start.each, strict=True)):
         doubt = np.array(built.DOUBT)
         _, values, directions = np.linalg.svd(derivatives[:, :, i].reshape(-1, 5) * doubt, full_matrices=False)
-        for direction in directions[values > 1.0]:
+        for direction, value in zip(directions, values, strict=True):
             column = np.zeros((3, 5))
             column[i] = doubt * direction
-            columns.append(column.ravel())
+            (determined if value > 1.0 else undetermined).append(column.ravel())
         if len(rest := directions[values <= 1.0]):
             shares = np.linalg.norm(rest, axis=0)
             names = tuple(name for name, share in zip(built.PARAMETERS, shares, strict=True) if share > MIN_NAMED_SHARE)
             unknown.append(Open(leg, names, len(rest)))
-    if not columns:
+    if not determined:
         raise CalibrationError(
             "the stated noise is too large: the poses determine nothing better than drawings do; state less noise, or "
             "add poses"
         )
-    return np.stack(columns, axis=1), tuple(unknown)
+    return np.stack(determined, axis=1), np.reshape(undetermined, (-1, 15)).T, tuple(unknown)
