@@ -135,7 +135,24 @@ def test_what_makes_no_map_is_said_in_a_line(tmp_path: Path, capsys: pytest.Capt
     )
     assert "cannot be reached with the configured geometry" in said(poses, sliders * 10.0)
     wild = np.random.default_rng(2).normal(0.0, 3e-3, poses.shape)
-    assert re.search("too steep near x|expected float", said(poses + wild * [1.0, 1.0, 5.0], sliders))
+    assert re.search("too steep near x|calibrate .geometry. first", said(poses + wild * [1.0, 1.0, 5.0], sliders))
+    far = robot(1, 4e-2)
+    assert re.search(
+        r"of up to 0\.0\d+ (m in x|m in y|rad in phi), more than 0\.02: calibrate \[geometry\] first",
+        said(poses, inverse(far, poses).position),
+    )
+
+
+def test_a_measured_angle_may_be_whole_turns_off_but_covers_nothing_there() -> None:
+    poses = reached(120, 1)
+    sliders = inverse(robot(1), poses).position
+    turned = poses + np.outer(np.random.default_rng(1).integers(-2, 3, len(poses)), [0.0, 0.0, 2.0 * np.pi])
+    found, same = (fit(PLAIN, each, sliders, ROOM, (2, 2, 2)) for each in (turned, poses))
+    np.testing.assert_allclose(found.correction.nodes, same.correction.nodes, atol=1e-12)
+    below = poses[:, 2] < 0.0
+    turned = poses[below] + np.outer(np.arange(below.sum()) < 3, [0.0, 0.0, 2.0 * np.pi])
+    with pytest.raises(CalibrationError, match=r"^phi was measured from"):
+        fit(PLAIN, turned, sliders[below], ROOM, (2, 2, 2))
 
 
 def test_the_report_says_what_to_expect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

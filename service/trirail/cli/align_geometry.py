@@ -157,19 +157,19 @@ def _usable_map(result: GeometryCalibration, settings: Config, *, quiet: bool) -
     if result.map is None or not result.map.helps:
         return None
     before, after = result.map.before, result.map.after
-    made = as_built.measured_today(result.map.correction, result.geometry)
     words = (
         f"A map of the remaining errors lowers them at held-out looks from {before[0] * 1e6:.2f} to "
         f"{after[0] * 1e6:.2f} µm, and from {before[1] * 1e6:.2f} to {after[1] * 1e6:.2f} µrad"
     )
+    made = None
     try:
+        made = as_built.measured_today(result.map.correction, result.geometry)
         config.check_as_built(made, result.geometry, settings.limits)
-        usable = True
     except ConfigError as error:
-        usable, words = False, f"{words}, but it is refused: {error}"
+        made, words = None, f"{words}, but it is refused: {error}"
     if not quiet:
         terminal.print_line(words)
-    return made if usable else None
+    return made
 
 
 def _answers_yes(question: str) -> bool:

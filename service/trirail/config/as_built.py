@@ -44,7 +44,9 @@ TRAVEL_MARGIN_M = 0.03
 samples is missed."""
 COORDINATES = (("x", "m"), ("y", "m"), ("phi", "rad"))
 
-Error = Annotated[float, Meta(ge=-0.02, le=0.02)]
+LARGEST = 0.02
+"""Largest coefficient of a correction [m] or [rad]."""
+Error = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 """Coefficient of the correction [m] or [rad]; a larger one belongs in [geometry]."""
 Node = tuple[Error, Error, Error]
 Row = Annotated[tuple[Node, ...], Meta(min_length=4, max_length=11)]
@@ -100,7 +102,16 @@ def correction(as_built: AsBuilt) -> Correction:
 
 
 def measured_today(errors: Correction, robot: Geometry) -> AsBuilt:
-    """Return the map for a correction that was measured today on a robot with this [geometry]."""
+    """Return the map for a correction that was measured today on a robot with this [geometry].
+
+    Raises ConfigError if the correction is too large for a map.
+    """
+    for (name, unit), most in zip(COORDINATES, np.abs(errors.nodes).max(axis=(0, 1, 2)).tolist(), strict=True):
+        if not most <= LARGEST:
+            raise ConfigError(
+                f"the poses need corrections of up to {most:.3g} {unit} in {name}, more than {LARGEST:g}: calibrate "
+                "[geometry] first, check the outermost poses, or use fewer cells"
+            )
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     return AsBuilt(today, geometry_of(robot), errors.low, errors.high, errors.nodes.tolist())
 

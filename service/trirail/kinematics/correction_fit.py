@@ -70,11 +70,13 @@ class Fit(NamedTuple):
 def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Sequence[int]) -> Fit:
     """Return the correction of a geometry from measured `poses` and `sliders`, both (N, 3) in m and rad.
 
-    The correction covers the whole room, with the given numbers of cells along x, y and phi. Raises CalibrationError if
-    there are too few poses, if the poses do not cover the robot's reach, or if the geometry cannot reach a measured
-    pose.
+    The correction covers the whole room, with the given numbers of cells along x, y and phi. A measured phi may be
+    whole turns off. Raises CalibrationError if there are too few poses, if the poses do not cover the robot's reach, or
+    if the geometry cannot reach a measured pose.
     """
     low, high = room.low, room.high
+    turns = np.round((poses[:, 2] - (low[2] + high[2]) / 2.0) / (2.0 * math.pi))
+    poses = poses - np.outer(turns, [0.0, 0.0, 2.0 * math.pi])
     group = _distinct(poses, SAME_POSE_SHARE * np.subtract(high, low) / cells)
     distinct = int(group.max(initial=-1)) + 1
     if distinct < MIN_POSES:
