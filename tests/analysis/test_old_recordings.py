@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from trirail.analysis.replay import replay_session
 from trirail.analysis.summary import summarise
+from trirail.motion.rules import RULES
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
 
+SOFTWARE_OF_BEFORE = '{"trirail": "0.1.0", "source": "0", "machine": "Linux x86_64", "versions": {}}'
 RECORDINGS = sorted((Path(__file__).parents[1] / "data" / "recordings").iterdir())
 
 
@@ -38,3 +40,8 @@ def test_a_recording_of_an_earlier_version_is_replayed_to_the_last_bit(packed: P
 
 def test_there_are_recordings_of_three_earlier_versions() -> None:
     assert len(RECORDINGS) >= 3
+
+
+def test_a_recording_names_the_rules_of_its_changes_of_rate() -> None:
+    assert provenance.recorded_by({provenance.SOFTWARE: SOFTWARE_OF_BEFORE}).rules == 1  # type: ignore[union-attr]
+    assert provenance.software().rules == RULES > 1

@@ -33,6 +33,7 @@ from trirail.control.transitions import Transitions
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.backlash_reserve import planned_limits, reserve_for_backlash
 from trirail.motion.limits import SETPOINT_TOLERANCE, Bounds, standing_tolerance
+from trirail.motion.rules import RULES
 from trirail.motion.runs import ZERO_RATES, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames
@@ -80,13 +81,14 @@ class SteadyState(NamedTuple):
 class Control:
     """Control of one robot with its drives: modes, goals, commands, setpoints and outputs."""
 
-    def __init__(self, config: Config, drives: DriveGroup, planner: PlannerPort) -> None:
+    def __init__(self, config: Config, drives: DriveGroup, planner: PlannerPort, rules: int = RULES) -> None:
+        """`rules` is the version of the rules by which the rate changes; see trirail.motion.rules."""
         robot = corrected_geometry(config)
         self._labels = robot.labels
         self._drives = drives
         self._period = self.period = config.period
         self.schedule = Schedule(rest(ZERO_RATES), config.period)
-        self._planner = PlanRequests(config, planner, self.schedule)
+        self._planner = PlanRequests(config, planner, self.schedule, rules)
         self.outputs = Outputs(config.outputs, config.inputs, config.period)
         self.ledger = Ledger(self._goal_ended)
         frames, queue = NamedFrames(config.frames), config.motion.queue

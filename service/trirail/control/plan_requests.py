@@ -25,6 +25,7 @@ from trirail.motion.motion_planner import revision
 from trirail.motion.packing import pack_run, unpack_law, unpack_path, unpack_run
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.rate_change import RateChange
+from trirail.motion.rules import RULES
 from trirail.motion.runs import ZERO_RATES, MotionState, OwnBounds, Run, nominal_motion, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
@@ -70,14 +71,15 @@ class AcceptedPlan(NamedTuple):
 class PlanRequests:
     """Updates of the motion schedule. Changes of the rate are computed here; goals are planned by the planner."""
 
-    def __init__(self, config: Config, port: PlannerPort, schedule: Schedule) -> None:
+    def __init__(self, config: Config, port: PlannerPort, schedule: Schedule, rules: int = RULES) -> None:
+        """`rules` is the version of the rules by which the rate changes; see trirail.motion.rules."""
         self.override = 1.0
         """Speed override of all motions, as a factor."""
         self._running = False
         robot, self._period = corrected_geometry(config), config.period
         limits = planned_limits(config.limits, config.correction.backlash)
         checker = Checker(robot, limits, Bounds(limits, self._period, labels=robot.labels), self._period)
-        self._scaling = TimeScaling(robot, checker, self._period)
+        self._scaling = TimeScaling(robot, checker, self._period, rules)
         self._legs = robot.packed()
         self._revision = revision(config)
         self._port = port

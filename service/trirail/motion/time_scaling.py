@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +16,13 @@ from trirail.kinematics.robot import inverse_into
 from trirail.motion.feasibility import Checker, SampleResult
 from trirail.motion.paths import Path, constant_law, law_falls
 from trirail.motion.ruckig_call import try_solve
+from trirail.motion.rules import RULES
 from trirail.motion.runs import LawState, MotionState, Run, arrival_time, law_from_ruckig
 
 FINE_RATIO, COARSE_RATIO = 0.88, 0.6
+FIRST_SHARES = (*(FINE_RATIO**k for k in range(4)), *(FINE_RATIO**3 * COARSE_RATIO**k for k in range(1, 16)))
+"""Fractions of the quickest change at the present speed, which are tried first, as long as they are quicker than a
+change at full speed."""
 CHANGE_SHARES = (*(FINE_RATIO**k for k in range(12)), *(FINE_RATIO**11 * COARSE_RATIO**k for k in range(1, 9)))
 """Fractions of the quickest change of rate at full speed, which are tried in turn. A smaller fraction gives a longer
 stop. The steps between the fractions are fine for quick stops. They are coarse for long stops, which only robots with
@@ -34,11 +39,17 @@ class Quickness(NamedTuple):
         """Return a fraction of this quickness."""
         return Quickness(share * self.change, share * self.jerk)
 
+    def duration(self, by: float) -> float:
+        """Return the duration of a change of the rate by `by`, from a constant rate to a constant rate [s]."""
+        change, jerk = self
+        return by / change + change / jerk if by * jerk > change**2 else 2.0 * math.sqrt(by / jerk)
+
 
 class TimeScaling:
     """Generator of laws for the paths of one robot."""
 
-    def __init__(self, geometry: Geometry, checker: Checker, period: float) -> None:
+    def __init__(self, geometry: Geometry, checker: Checker, period: float, rules: int = RULES) -> None:
+        self._first_shares = FIRST_SHARES if rules > 1 else ()
         self._legs = geometry.packed()
         self._checker = checker
         self._period = period
@@ -78,11 +89,12 @@ class TimeScaling:
 
         `shares` are fractions of the quickest change at full speed, which are yielded last.
         """
-        full = self.full_speed
-        quick = self._present_speed(at.rate, motion) if rate < at.rate else None
-        while quick is not None and (quick.change > full.change or quick.jerk > full.jerk):
-            yield Quickness(max(quick.change, full.change), max(quick.jerk, full.jerk))
-            quick = quick.scaled(COARSE_RATIO)
+        full, by = self.full_speed, at.rate - rate
+        present = self._present_speed(at.rate, motion) if by > 0.0 else None
+        if present is not None:
+            yield from takewhile(
+                lambda quick: quick.duration(by) < full.duration(by), map(present.scaled, self._first_shares)
+            )
         yield from map(full.scaled, shares)
 
     def last_new_time(self, run: Run, law: Path, rate: float) -> float:

@@ -17,6 +17,7 @@ from trirail_drivers.interface import NAMES
 
 from trirail.config import Config, parse_values
 from trirail.errors import ConfigError
+from trirail.motion.rules import RULES
 from trirail.naming import Labels
 from trirail.wire.decoding import INVALID, decoded, prepare
 
@@ -35,6 +36,8 @@ class Software(msgspec.Struct, frozen=True):
     """Hash of the source files of both packages. It distinguishes development versions with the same version number."""
     machine: str
     versions: dict[str, str]
+    rules: int = 1
+    """Version of the rules by which the loop changes the rate of a motion; see trirail.motion.rules."""
 
     def __str__(self) -> str:
         return f"trirail {self.trirail}, source {self.source}, on {self.machine}"
@@ -46,7 +49,7 @@ prepare(Software)
 @cache
 def software() -> Software:
     """Return the versions of the running software."""
-    return Software(version("trirail"), fingerprint(), f"{platform.system()} {platform.machine()}", versions())
+    return Software(version("trirail"), fingerprint(), f"{platform.system()} {platform.machine()}", versions(), RULES)
 
 
 def versions() -> dict[str, str]:

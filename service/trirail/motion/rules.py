@@ -1,0 +1,6 @@
+"""Version of the rules by which the loop changes the rate of a motion. Recordings name it, and replays follow it."""
+
+from typing import Final
+
+RULES: Final = 2
+"""1: only fractions of the quickest change at full speed. 2: changes that suit the present speed are tried first."""
