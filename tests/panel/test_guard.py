@@ -33,6 +33,7 @@ from trirail.telemetry.recorder import Recorder
 from trirail.wire import zenoh_session
 from trirail.wire.messages import CommandReply, RoleReply
 from trirail.wire.state import Info, NamedPoses
+from trirail.wire.stop_protocol import STOPS
 from trirail.wire.vocabulary import Command
 from waiting import WITHIN, wait_until
 from websockets.exceptions import InvalidStatus
@@ -346,6 +347,31 @@ def test_what_is_no_message_is_refused_and_the_tab_goes_on(panel: Panel, message
         while not said or "done" not in said[-1]:
             said.append(str(opened.recv(WITHIN)))
     assert any("not a message of this page" in text for text in said)
+
+
+BAD_VALUE = st.none() | st.text(max_size=5) | st.floats(0.1, 0.9) | st.lists(st.integers(), max_size=2)
+
+
+@given(
+    name=st.sampled_from(sorted(STOPS)),
+    bad=st.tuples(st.just("seen"), BAD_VALUE) | st.tuples(st.sampled_from(["", "x", "stamp"]), BAD_VALUE | st.integers()),
+    twice=st.booleans(),
+)
+def test_a_stop_stops_whatever_else_is_wrong_with_its_message(name: str, bad: tuple[str, object], twice: bool) -> None:
+    message = msgspec.json.encode({"do": "command", "name": name, bad[0]: bad[1]}).decode()
+    if twice:
+        message = f'{{"do": "command", "seen": 1, "seen": 1, "name": "{name}"}}'
+    robot = FakeRobot()
+    with Panel(robot.robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+        opened.send('{"do": "command", "name": "enable", "seen": "x"}')
+        opened.send(message)
+        opened.send('{"do": "end"}')
+        told: list[dict[str, Any]] = []
+        while len(told) < 4:
+            if (said := msgspec.json.decode(opened.recv(WITHIN)))["tell"] in ("refused", "done"):
+                told.append(said)
+    assert sorted(said["tell"] for said in told) == ["done", *3 * ["refused"]]
+    assert robot.commands == [name]
 
 
 @pytest.mark.parametrize("end", ["released", "closed"])

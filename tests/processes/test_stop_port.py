@@ -156,16 +156,83 @@ def test_who_sends_no_more_is_answered_all_the_same(cut: int, newline: bool) -> 
     line = request[: len(request) - cut]
     folder = tempfile.TemporaryDirectory()
     config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=(f"unixsock-stream/{folder.name}/z",)))
+    named = b'/stop"' in line
     with folder, contextlib.contextmanager(opened)(config) as (locator, asked), connected(locator) as calling:
         asked.held = []
         calling.sendall(line + b"\n" * newline)
         calling.shutdown(socket.SHUT_WR)
-        if whole := not cut:
+        if named:
             wait_until(lambda: bool(asked.held))
             asked.held.pop()(DONE)
         answer = calling.recv(MAX_LINE)
+    whole = not cut
     assert (b'"reply"' in answer) == whole
     assert (b"malformed" in answer) == (not whole and bool(line or newline))
+    assert (b"stop is carried out nevertheless" in answer) == (named and not whole)
+
+
+ANY_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+NO_TEXT = ANY_JSON.filter(lambda value: not isinstance(value, str))
+UNKNOWN = st.text(max_size=5).filter(lambda name: name not in ("key", "id", "content"))
+BAD_FIELD = st.one_of(
+    st.tuples(st.sampled_from(["id", "content"]), NO_TEXT),
+    st.tuples(UNKNOWN, ANY_JSON),
+    st.sampled_from([("key", None), ("id", "twice"), ("content", "{}")]),  # besides the valid ones: given twice
+)
+BAD_ENDS = (b"", b"]", b"}}", b', "content": {goal: 5}}', b', "id": NaN}', b', "content": "\xff"}')
+LONG_ENDS = (b', "content": ' + b"[" * 3000, b', "content": "' + b"x" * MAX_LINE)
+
+
+@st.composite
+def spoiled_stops(draw: st.DrawFn, key: str) -> bytes:
+    """Draw a line with the key of a stop, of which something else is invalid."""
+    bad = draw(st.lists(BAD_FIELD, max_size=2))
+    end: bytes = draw(st.sampled_from((b"}", *BAD_ENDS, *LONG_ENDS) if bad else BAD_ENDS + LONG_ENDS))
+    fields: list[tuple[str, object]] = [("key", key), ("id", "s-1"), ("content", "")]
+    fields = draw(st.permutations(fields + [(name, key if name == "key" else value) for name, value in bad]))
+    members = b", ".join(msgspec.json.encode(name) + b": " + msgspec.json.encode(value) for name, value in fields)
+    return b"{" + members + end
+
+
+@given(name=st.sampled_from(sorted(STOPS)), data=st.data(), newline=st.booleans())
+def test_a_line_with_the_key_of_a_stop_stops_whatever_else_is_wrong_with_it(
+    name: str, data: st.DataObject, newline: bool
+) -> None:
+    line = data.draw(spoiled_stops(key := f"trirail/demo/cmd/ann/{name}"))
+    folder = tempfile.TemporaryDirectory()
+    config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=(f"unixsock-stream/{folder.name}/z",)))
+    with folder, contextlib.contextmanager(opened)(config) as (locator, asked), connected(locator) as calling:
+        calling.sendall(line + b"\n" * newline)
+        calling.shutdown(socket.SHUT_WR)
+        answer = calling.recv(MAX_LINE)
+    assert [(request.key, request.content) for request in asked.requests] == [(key, "")]
+    if len(line) <= MAX_LINE:  # of a longer line, the rest may come before the answer
+        assert b'"malformed"' in answer
+        assert b"; stop is carried out nevertheless" in answer
+
+
+@pytest.mark.parametrize("name", sorted(set(Command) - STOPS))
+def test_nothing_but_a_stop_is_carried_out_of_an_invalid_line(plain: Opened, name: str) -> None:
+    locator, asked = plain
+    with connected(locator) as calling:
+        calling.sendall(b'{"key": "trirail/demo/cmd/ann/%s", "id": 5}\n' % name.encode())
+        assert b"unknown_command" in calling.recv(MAX_LINE)
+    assert asked.requests == []
+
+
+def test_an_invalid_line_stops_only_for_who_may(secured: Opened, tmp_path: Path) -> None:
+    locator, asked = secured
+    context = tls.client(Credentials.read(user(tmp_path, "ann")))
+    for name in ("max", "ann"):
+        with context.wrap_socket(connected(locator), server_hostname="127.0.0.1") as calling:
+            calling.sendall(b'{"key": "trirail/demo/cmd/%s/stop", "content": {"goal": 5}}\n' % name.encode())
+            answer = calling.recv(MAX_LINE)
+        assert (b"not_allowed" in answer) == (name == "max")
+    assert [request.key for request in asked.requests] == ["trirail/demo/cmd/ann/stop"]
 
 
 def silent(connection: socket.socket, number: int) -> None:

@@ -11,10 +11,11 @@ from typing import Annotated, ClassVar
 from msgspec import Meta, Raw, Struct
 
 from trirail.panel.permissions import GOAL, POSES, TAKEOVER
-from trirail.wire.decoding import INVALID, decoded
+from trirail.wire.decoding import INVALID, decoded, decoder, prepare
 from trirail.wire.goal_kind import FrameName
 from trirail.wire.goals import Coordinates, MoveGoal, NamedGoal, PoseGoal
 from trirail.wire.sizes import MAX_FILE
+from trirail.wire.stop_protocol import STOPS
 from trirail.wire.vocabulary import Command, Override
 
 
@@ -173,3 +174,20 @@ class Forget(_PageMessage, frozen=True, tag="forget"):
 ServiceRequest = SendCommand | TakeOver | SendGoal | Follow | Teach | Forget
 """Requests that the server passes on to the service, except jogs."""
 AnyPageMessage = StateDrawn | JogHeld | JogReleased | CheckPose | BeginUpload | CheckPath | ServiceRequest
+
+
+class _NameOnly(Struct, frozen=True, tag_field="do", tag="command"):
+    """Message with a command of which only the name is read."""
+
+    name: Command
+
+
+prepare(AnyPageMessage, _NameOnly)
+
+
+def stop_in(text: str) -> SendCommand | None:
+    """Return the stop in an invalid message, without its content. Return None if the message is not a stop."""
+    with contextlib.suppress(*INVALID):
+        name = decoder(_NameOnly).decode(text.encode()).name
+        return SendCommand(name) if name in STOPS else None
+    return None

@@ -26,10 +26,11 @@ from trirail.panel.messages import (
     JogReleased,
     SendCommand,
     StateDrawn,
+    stop_in,
 )
 from trirail.panel.tab_requests import OUTDATED, TabRequests, refusal
 from trirail.panel.uploads import UploadedFile, Uploads
-from trirail.wire.decoding import INVALID, decoded, prepare
+from trirail.wire.decoding import INVALID, decoded
 from trirail.wire.goals import Goal
 
 
@@ -78,9 +79,6 @@ If a tab is frozen or the network is slow, the tab receives no further states, s
 """
 MAX_ANSWERS = 200
 """Maximum number of answers that are stored for a tab that does not read them; the oldest answers are dropped."""
-
-prepare(AnyPageMessage)
-
 
 class Tab:
     """Handler of the WebSocket of one tab. When the socket closes, the handler ends the tab's jog and lease.
@@ -143,7 +141,12 @@ class Tab:
             message: AnyPageMessage = decoded(text, AnyPageMessage)
         except INVALID as error:
             self._refuse_message(f"not a message of this page: {error}")
+            if (stop := stop_in(text)) is not None:  # as in the service, a stop is carried out nevertheless
+                self._handle(stop)
             return
+        self._handle(message)
+
+    def _handle(self, message: AnyPageMessage) -> None:
         if message.required_permission is not None and message.required_permission not in self._feed.permissions:
             words = f"your role does not allow {message.required_permission}"
             self._enqueue("refused", to=message.required_permission, message=words, code=RefusalCode.NOT_ALLOWED)

@@ -25,7 +25,7 @@ from trirail.processes.sockets import Reserve, close, descriptor_limit, listen, 
 from trirail.wire import tls
 from trirail.wire.decoding import INVALID, decoded
 from trirail.wire.messages import CommandReply, ErrorReply
-from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answer_with
+from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answer_with, request_without_content
 from trirail.wire.text import quoted
 
 MAX_CALLERS: Final = 4096
@@ -206,9 +206,7 @@ class StopPort:
             user = tls.peer(secured)
             self._enter(caller, _Stage.KNOWN, user)
         heard = b""
-        while b"\n" not in heard:
-            if len(heard) > MAX_LINE:
-                raise ConnectionError
+        while b"\n" not in heard and len(heard) <= MAX_LINE:
             data = await self._receive(caller)
             if not data and not heard:
                 raise ConnectionError
@@ -246,12 +244,19 @@ class StopPort:
     async def _answer(self, caller: _Caller, user: str, line: bytes) -> CommandReply | ErrorReply:
         """Forward a request and return the answer.
 
-        Raises OSError if the connection breaks or the client sends further data before the answer.
+        The sender of an invalid line whose key names a stop wants to stop the robot. The stop is carried out as if it
+        had no content, and the answer is an error. Raises OSError if the connection breaks or the client sends further
+        data before the answer.
         """
+        problem = ""
         try:
             request = decoded(line, StopRequest)
         except INVALID as error:
-            return ErrorReply(RefusalCode.MALFORMED, quoted(f"not a valid stop request: {error}"))
+            problem = quoted(f"not a valid stop request: {error}")
+            readable = request_without_content(line)
+            if readable is None:
+                return ErrorReply(RefusalCode.MALFORMED, problem)
+            request = readable
         self._enter(caller, _Stage.WAITING, user or str(request.key.split("/")[3:4]))
         answered: asyncio.Future[CommandReply | ErrorReply] = self._loop.create_future()
 
@@ -272,7 +277,10 @@ class StopPort:
             await asyncio.wait((answered, more), return_when=asyncio.FIRST_COMPLETED)
             if not answered.done() and more.result():
                 raise ConnectionError
-            return await answered
+            reply = await answered
         finally:
             more.cancel()
             await asyncio.gather(more, return_exceptions=True)
+        if problem and isinstance(reply, CommandReply):
+            return ErrorReply(RefusalCode.MALFORMED, f"{problem}; {reply.command} is carried out nevertheless")
+        return reply

@@ -6,6 +6,8 @@ clients that occupy the Zenoh endpoint cannot delay a stop.
 
 from __future__ import annotations
 
+import contextlib
+import re
 from typing import NamedTuple
 
 import msgspec
@@ -13,7 +15,7 @@ from msgspec import Struct
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
-from trirail.wire.decoding import prepare
+from trirail.wire.decoding import INVALID, decoder, prepare
 from trirail.wire.endpoints import LAST_PORT, ReachableBy, reach, socket_file, tcp_address
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.vocabulary import Command
@@ -50,7 +52,15 @@ class StopAnswer(Struct, frozen=True, omit_defaults=True):
     error: ErrorReply | None = None
 
 
-prepare(StopRequest, StopAnswer)
+class _KeyOnly(Struct, frozen=True):
+    """Request of which only the key is read."""
+
+    key: str
+
+
+prepare(StopRequest, StopAnswer, _KeyOnly, str)
+_KEY = re.compile(rb'"key"\s*:\s*("(?:[^"\\]|\\.)*")')
+"""Key in a line that is not JSON, for example because it is cut off."""
 
 
 class StopAddress(NamedTuple):
@@ -79,6 +89,16 @@ def stop_address(endpoint: str) -> StopAddress | None:
     host, port = address
     stop_port = port + PORT_OFFSET if port + PORT_OFFSET <= LAST_PORT else port - PORT_OFFSET
     return StopAddress((host, stop_port), secured=reach(endpoint) is ReachableBy.CERTIFICATE)
+
+
+def request_without_content(line: bytes) -> StopRequest | None:
+    """Return a request with the key of an invalid line. Return None if the line contains no readable key."""
+    with contextlib.suppress(*INVALID):
+        return StopRequest(decoder(_KeyOnly).decode(line).key)
+    if (match := _KEY.search(line)) is not None:
+        with contextlib.suppress(*INVALID):
+            return StopRequest(decoder(str).decode(match[1]))
+    return None
 
 
 def command_of(request: StopRequest, robot: str) -> tuple[str, Command]:
