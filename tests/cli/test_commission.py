@@ -88,6 +88,18 @@ def test_what_is_refused_step_by_step_leaves_nothing_wrong(
     assert len(list(tmp_path.glob("commission-demo-*.json"))) == len(list(tmp_path.glob("commission-demo-*.txt"))) == 1
 
 
+@pytest.mark.parametrize("answers", [b"", b"q\n", b"\n\nq\n", b"\n\ns\n", b"s\n" * 30])
+def test_a_guide_that_was_left_or_of_which_no_step_was_run_is_no_success(
+    robot: str, typed: int, capsys: pytest.CaptureFixture[str], answers: bytes
+) -> None:
+    """By a person, or because the lines of a script have ended."""
+    os.write(typed, answers)
+    os.close(typed)
+    assert run(robot, "--json") == 1
+    report = json.loads(capsys.readouterr().out)
+    assert (report["ok"], report["complete"]) == (False, False)
+
+
 def test_values_that_the_other_keys_forbid_are_told_and_reported(
     robot: str, typed: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -106,7 +118,7 @@ def test_back_leads_past_steps_that_cannot_run(robot: str, typed: int, capsys: p
         typed, b"\n\n" + b"s\n" * 6 + b"b\nq\n"
     )  # nothing has had power, so no drive may move: b from the switches
     os.close(typed)
-    assert run(robot) == 0
+    assert run(robot) == 1, "the person has quit"
     assert re.findall(r"^\d+/\d+  (.*)$", capsys.readouterr().out, re.MULTILINE)[-2:] == [
         "Switches of slider A",
         "Power on drive C alone",

@@ -48,8 +48,8 @@ def commission(
     drive alone, move it 1 mm there and back, test the watchdogs, home, move the platform along a square, and determine
     the kind of mechanism. The command then writes a new configuration with the results. You can refuse and repeat every
     step. Ctrl-C and Ctrl-Z stop all drives immediately and end the command. A report is saved. Answers are lines of
-    standard input, from a person or a script. The exit code is 0 only if no step found an error. Stop the service
-    first.
+    standard input, from a person or a script. The exit code is 0 only if the guide was followed to its end, at least
+    one step was run, and no step found an error. Stop the service first.
 
     Parameters
     ----------
