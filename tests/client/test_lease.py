@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import queue
+import signal
 import threading
 from collections.abc import Iterator
 
@@ -135,6 +136,51 @@ def test_who_does_not_get_it_keeps_nothing_up(loop: LoopThread) -> None:
         raise AssertionError
     assert threading.active_count() <= before  # of other tests some may end meanwhile
     assert service.asked.qsize() == 1
+
+
+class Silent(Service):
+    """Grants the lease, but its reply to that does not come until it is told to; nor that to the release, if `deaf`."""
+
+    def __init__(self, loop: LoopThread, *, deaf: bool) -> None:
+        super().__init__(loop)
+        self.deaf = deaf
+
+    async def command(self, name: Command, content: bytes) -> CommandReply:
+        self.asked.put((name, content))
+        if self.deaf or name is Command.ACQUIRE:
+            await asyncio.Event().wait()
+        return CommandReply(name, self.mode, 0)
+
+
+@pytest.mark.parametrize("deaf", [False, True])
+def test_who_is_cancelled_while_the_lease_is_granted_gives_it_back(loop: LoopThread, deaf: bool) -> None:
+    service = Silent(loop, deaf=deaf)
+
+    async def cancelled() -> bool:
+        entering = asyncio.create_task(AsyncLease(service.command, force=False, timeout=0.1).__aenter__())
+        while service.asked.empty():
+            await asyncio.sleep(0.0)
+        entering.cancel()
+        await asyncio.wait([entering])
+        return entering.cancelled()
+
+    assert loop.call(cancelled())
+    (acquire, asked), (release, given) = [service.next() for _ in range(service.asked.qsize())]
+    assert (acquire, release) == (Command.ACQUIRE, Command.RELEASE)
+    assert msgspec.json.decode(given, type=ReleaseLease).id == sign(asked).id
+
+
+def test_ctrl_c_while_the_lease_is_granted_gives_it_back(loop: LoopThread) -> None:
+    service = Silent(loop, deaf=False)
+
+    def interrupt() -> None:
+        assert service.next()[0] is Command.ACQUIRE
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt), service.lease():
+        raise AssertionError
+    assert service.next()[0] is Command.RELEASE
 
 
 def test_who_cannot_wait_for_the_standstill_gives_it_back(loop: LoopThread) -> None:

@@ -354,7 +354,8 @@ BAD_VALUE = st.none() | st.text(max_size=5) | st.floats(0.1, 0.9) | st.lists(st.
 
 @given(
     name=st.sampled_from(sorted(STOPS)),
-    bad=st.tuples(st.just("seen"), BAD_VALUE) | st.tuples(st.sampled_from(["", "x", "stamp"]), BAD_VALUE | st.integers()),
+    bad=st.tuples(st.just("seen"), BAD_VALUE)
+    | st.tuples(st.sampled_from(["", "x", "stamp"]), BAD_VALUE | st.integers()),
     twice=st.booleans(),
 )
 def test_a_stop_stops_whatever_else_is_wrong_with_its_message(name: str, bad: tuple[str, object], twice: bool) -> None:

@@ -24,8 +24,8 @@ _PASSING = RefusalCode.BUSY, RefusalCode.TIMEOUT
 class AsyncLease:
     """Context manager that holds the lease and renews it in a task; see trirail.client.blocking.Lease.
 
-    If a task is cancelled while it enters the context, the lease is not renewed and times out. `command` is a function
-    that sends a command with its content, such as AsyncRobot.command.
+    If a task is cancelled while it enters the context, the lease is released. `command` is a function that sends a
+    command with its content, such as AsyncRobot.command.
     """
 
     def __init__(
@@ -48,7 +48,13 @@ class AsyncLease:
 
     async def __aenter__(self) -> Self:
         asked = msgspec.structs.replace(self._sign, force=self._force)
-        reply = await self._command(Command.ACQUIRE, msgspec.json.encode(asked))
+        try:
+            reply = await self._command(Command.ACQUIRE, msgspec.json.encode(asked))
+        except asyncio.CancelledError:  # the service may have granted the lease
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(self._sign.timeout):  # afterwards, the lease has ended in any case
+                    await self._release()
+            raise
         self._keeping = asyncio.create_task(self._keep(), name="lease")
         if reply.mode == Mode.STOPPING:
             try:
@@ -65,6 +71,9 @@ class AsyncLease:
         if self._keeping is not None:
             self._keeping.cancel()
             await asyncio.wait([self._keeping])
+        await self._release()
+
+    async def _release(self) -> None:
         with contextlib.suppress(TrirailError):  # without a reply, the time-out ends the lease
             await self._command(Command.RELEASE, msgspec.json.encode(ReleaseLease(self._sign.id)))
 

@@ -80,6 +80,7 @@ If a tab is frozen or the network is slow, the tab receives no further states, s
 MAX_ANSWERS = 200
 """Maximum number of answers that are stored for a tab that does not read them; the oldest answers are dropped."""
 
+
 class Tab:
     """Handler of the WebSocket of one tab. When the socket closes, the handler ends the tab's jog and lease.
 
