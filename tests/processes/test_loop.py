@@ -44,6 +44,7 @@ from trirail.wire.packets import (
     Disturbance,
     DrivesFault,
     EventReport,
+    EventsWritten,
     GoalRequest,
     Kind,
     Refused,
@@ -466,6 +467,33 @@ def test_a_restarted_gateway_gets_all_events_in_order_few_in_a_cycle(before: int
             told += new
         assert told == list(range(1, len(told) + 1))
         assert len(told) >= before
+    shell.rig.bus.shutdown()
+
+
+@given(read=st.integers(0, 20), unread=st.integers(0, 20), absent=st.integers(0, 20))
+@settings(max_examples=10)
+def test_a_restarted_recorder_gets_every_event_that_was_not_written(read: int, unread: int, absent: int) -> None:
+    """The recorder before it may have been killed, or frozen, with unread packets in its socket."""
+    with TemporaryDirectory() as folder, closing(Shell(Rig(), Path(folder))) as shell:
+
+        def announce(number: int) -> None:
+            notices = shell.loop.control.ledger.notices
+            notices.extend(Notice("service", "info", "output switched") for _ in range(number))
+            shell.cycles(5 + number // SENT_TOGETHER)
+
+        def received() -> list[int]:
+            return [answer.event.seq for answer in shell.said(shell.recorder) if isinstance(answer, EventReport)]
+
+        shell.enabled()
+        announce(read)
+        written = max(received())
+        shell.recorder.send(message(EventsWritten(written)))
+        announce(unread)
+        shell.recorder.close()
+        announce(absent)
+        shell.recorder = links.connect(shell.folder / "recorder")
+        shell.cycles(30)
+        assert received() == list(range(written + 1, shell.loop._reports._events + 1))
     shell.rig.bus.shutdown()
 
 

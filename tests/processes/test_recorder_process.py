@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import stat
@@ -25,7 +26,7 @@ from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.links import PACKETS_PER_TURN, LinkClosed, PacketLink
 from trirail.wire.messages import Event
-from trirail.wire.packets import EventReport, Kind, message
+from trirail.wire.packets import EventReport, EventsWritten, Kind, decode_recorder, message
 from trirail.wire.records import DTYPE, SIZE
 
 
@@ -66,6 +67,29 @@ def test_the_last_packets_of_a_loop_that_has_left_a_packet_unread_are_recorded(t
         recording.main(config_in(tmp_path), None, PacketLink(ours), heart, lambda _: None, lambda _: None, lambda: 99)
     (file,) = tmp_path.glob("*.rrd")
     assert len(read(file).records) == len(records)
+
+
+def test_the_loop_is_told_which_events_are_written(tmp_path: Path) -> None:
+    ours, loops = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, loops:
+        intake = recording.Intake(config_in(tmp_path), None, PacketLink(ours), lambda _: None)
+
+        def written() -> list[int]:
+            intake.save()
+            told = []
+            with contextlib.suppress(BlockingIOError):
+                while isinstance(said := decode_recorder(loops.recv(1000, socket.MSG_DONTWAIT)[1:]), EventsWritten):
+                    told.append(said.newest)
+            return told
+
+        assert written() == []
+        for seq in (1, 2):
+            intake.on_packet(
+                message(EventReport(Event("service", "info", "output switched", seq=seq, t=0.0, cycle=0, time=0.0)))
+            )
+        assert written() == [2]
+        assert written() == []
+        intake.close()
 
 
 class BusyLink(PacketLink):

@@ -30,6 +30,7 @@ from trirail.wire.packets import (
     Answer,
     ControlInput,
     EventReport,
+    EventsWritten,
     Kind,
     RecorderMessage,
     Status,
@@ -43,8 +44,9 @@ from trirail.wire.records import last_cycle
 GATHER = 0.14
 """Pause in which packets accumulate before they are read [s]. Waking up for each packet costs more than processing it.
 
-If the recorder is killed, less than 0.2 s of data is lost: the packets of this pause, and the batch in the loop. If the
-machine is too slow for the recorder, up to PACKETS_PER_TURN packets and those that wait in the socket are lost as well.
+If the recorder is killed, less than 0.2 s of records is lost: the packets of this pause, and the batch in the loop. If
+the machine is too slow for the recorder, up to PACKETS_PER_TURN packets and those that wait in the socket are lost as
+well. Events are not lost: the loop sends those that were not written to the next recorder.
 """
 
 NOT_FOR_OTHERS = 0o027
@@ -69,6 +71,8 @@ class Intake:
         self._ready = ready
         self._cycle = 0
         self._reported_unrecorded = ""
+        self._newest_event = self._reported_event = 0
+        """Number of the newest event, and the number that was reported to the loop last."""
         self._loop_death = LoopDeath(config.period, last_cycle)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
@@ -98,8 +102,13 @@ class Intake:
             self._handle_answer(decode_answer(content))
 
     def save(self) -> None:
-        """Write the processed packets. Report to the loop when writing begins to fail, and when it works again."""
+        """Write the processed packets, and report to the loop which events they contained.
+
+        Also report to the loop when writing begins to fail, and when it works again.
+        """
         self.recorder.save()
+        if self._newest_event != self._reported_event and self._send(EventsWritten(self._newest_event)):
+            self._reported_event = self._newest_event
         what, why = self.recorder.unrecorded  # only `what` is compared: `why` contains the free space, which changes
         if what != self._reported_unrecorded and self._send(Unrecorded(what and f"{what}: {why}")):
             self._reported_unrecorded = what
@@ -125,6 +134,7 @@ class Intake:
         self._loop_death.follow(answer)
         match answer:
             case EventReport(event):
+                self._newest_event = event.seq
                 recorder.event(event)
                 box.event(event)
             case ControlInput():

@@ -23,9 +23,11 @@ from trirail.wire.messages import Notice
 from trirail.wire.packets import (
     Announcement,
     ControlInput,
+    EventsWritten,
     GivenInput,
     Kind,
     Status,
+    Unrecorded,
     Welcome,
     decode_recorder,
     event_packet,
@@ -51,8 +53,8 @@ They normally wait, because the recorder does not need them earlier.
 EVENTS_KEPT = 1000
 """Number of events stored.
 
-A restarted gateway needs them, because the previous gateway may not have published all of them. A recorder needs them
-if it reads nothing for a while, for example because its disk is slow.
+A restarted gateway or recorder needs them, because the previous process may not have published or written all of them.
+A recorder also needs them if it reads nothing for a while, for example because its disk is slow.
 """
 
 
@@ -91,6 +93,8 @@ class Reports:
         self._kept: deque[bytes] = deque(maxlen=EVENTS_KEPT)
         self._answers: deque[bytes] = deque()
         self._sent_events = dict.fromkeys((gateway, recorder), 0)
+        self._written_events = 0
+        """Number of the newest event that a recorder has written."""
         self._inputs = 0
         self._unsent_inputs: list[ControlInput] = []
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
@@ -196,8 +200,7 @@ class Reports:
             if port.accept():
                 port.send(message(msgspec.structs.replace(self._welcome, newest_event=self._events)))
                 port.send(message(self._status))
-                if port is self._gateway:
-                    self._sent_events[port] = 0
+                self._sent_events[port] = 0 if port is self._gateway else self._written_events
 
     def report_protections(self) -> None:
         """Report to the gateway which protections the drives lack, if these have changed."""
@@ -242,10 +245,13 @@ class Reports:
             text = coded(words, EventCode.RECORDER_UNREADABLE, error=str(error))
             self._control.ledger.notices.append(Notice("service", "warning", text.text, **text.fields))
             return
-        if isinstance(content, Announcement):
-            self._control.ledger.notices.append(content.notice)
-        else:
-            self._unrecorded = quoted(content.why) if content.why else ""
+        match content:
+            case Announcement(notice):
+                self._control.ledger.notices.append(notice)
+            case EventsWritten(newest):
+                self._written_events = newest
+            case Unrecorded(why):
+                self._unrecorded = quoted(why) if why else ""
         self._publish_status()
 
     def _publish(self) -> None:

@@ -221,7 +221,14 @@ class Unrecorded(Struct, frozen=True, tag=True):
     """Reason why the recorder does not write; empty if it writes."""
 
 
-RecorderMessage = Announcement | Unrecorded
+class EventsWritten(Struct, frozen=True, tag=True):
+    """Message from the recorder to the loop that events have been written to the file."""
+
+    newest: int
+    """Number of the newest of these events."""
+
+
+RecorderMessage = Announcement | Unrecorded | EventsWritten
 Answer = Accepted | Checked | CommandDone | Refused | Welcome | EventReport | Status | ControlInput
 
 prepare(Request, Answer, RecorderMessage, *(command.content for command in Command))
