@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from certificates import tls_config, user
 from control_rig import CONFIG
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from ports import free_port
 from prometheus_client import CollectorRegistry, generate_latest
@@ -339,6 +339,19 @@ def drip(address: tuple[str, int], content: bytes) -> None:
             return
         time.sleep(0.05)
     raise AssertionError(f"{len(slow)} slow connections are still served")
+
+
+@given(st.lists(st.sampled_from([b"", b"G", b"GET /healthz HTTP/1.1\r\nX: a\r\n"]), min_size=MAX_CONNECTIONS, max_size=40))
+@settings(max_examples=5)
+def test_connections_without_a_whole_request_close_no_other_one(begun: list[bytes]) -> None:
+    config, server, looked = served(CONFIG)
+    looked.poll(ALL_UP)
+    address = ("127.0.0.1", config.telemetry.metrics_port)
+    with server, contextlib.ExitStack() as held:
+        for beginning in begun:
+            with contextlib.suppress(ConnectionError):  # it has had to make room
+                held.enter_context(socket.create_connection(address)).sendall(beginning)
+            assert get(f"http://{address[0]}:{address[1]}/healthz")[0] == 200
 
 
 def is_served(url: str, context: ssl.SSLContext | None = None) -> bool:

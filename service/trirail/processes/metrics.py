@@ -18,7 +18,7 @@ from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from socketserver import TCPServer
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 import msgspec
@@ -184,7 +184,10 @@ def _used(pid: int) -> tuple[float, float] | None:
 CONNECTION_TIMEOUT_S: Final = 5.0
 """Maximum duration of a connection, from the TLS handshake to the end of the answer [s]."""
 MAX_CONNECTIONS: Final = 16
-"""Maximum number of connections served at the same time; further connections are closed."""
+"""Maximum number of connections served at the same time.
+
+A further connection takes the place of the oldest one that has not sent a whole request; it is closed if all have.
+"""
 
 _Start = Callable[..., Any]
 
@@ -261,14 +264,30 @@ USER: Final = "trirail.user"
 
 
 class _Handler(WSGIRequestHandler):
-    slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
+    served: ClassVar[list[_Handler]] = []
+    """Handlers of all connections that are served, from the oldest to the newest."""
+    lock = threading.Lock()
+    waiting = True
+    """Whether the whole request has not arrived yet."""
 
     def handle(self) -> None:
-        if self.slots.acquire(blocking=False):  # otherwise, the connection is closed
-            try:
-                self._handle_in_time()
-            finally:
-                self.slots.release()
+        with self.lock:
+            if len(self.served) >= MAX_CONNECTIONS:
+                if (oldest := next((each for each in self.served if each.waiting), None)) is None:
+                    return
+                oldest._disconnect()
+                self.served.remove(oldest)
+            self.served.append(self)
+        try:
+            self._handle_in_time()
+        finally:
+            with self.lock, suppress(ValueError):  # a newer connection has taken the place
+                self.served.remove(self)
+
+    def parse_request(self) -> bool:
+        parsed = super().parse_request()
+        self.waiting = False
+        return parsed
 
     def _handle_in_time(self) -> None:
         """Handle the request, and end the connection after CONNECTION_TIMEOUT_S."""
