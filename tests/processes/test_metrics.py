@@ -341,7 +341,9 @@ def drip(address: tuple[str, int], content: bytes) -> None:
     raise AssertionError(f"{len(slow)} slow connections are still served")
 
 
-@given(st.lists(st.sampled_from([b"", b"G", b"GET /healthz HTTP/1.1\r\nX: a\r\n"]), min_size=MAX_CONNECTIONS, max_size=40))
+@given(
+    st.lists(st.sampled_from([b"", b"G", b"GET /healthz HTTP/1.1\r\nX: a\r\n"]), min_size=MAX_CONNECTIONS, max_size=40)
+)
 @settings(max_examples=5)
 def test_connections_without_a_whole_request_close_no_other_one(begun: list[bytes]) -> None:
     config, server, looked = served(CONFIG)

@@ -46,8 +46,15 @@ NO_NUMBERS = [math.nan, math.inf, -math.inf]
 def test_an_id_that_cannot_be_shown_is_refused(kind: type[Any]) -> None:
     assert kind(**GOOD[kind], id="g 17").id == "g 17"
     assert kind(**GOOD[kind]).id is None
-    for name in ("", "\x1b[2J", "a\nb", "x" * 65):
-        with pytest.raises(ValueError, match="is not printable"):
+    printable = "is not printable; use 1 to 64 characters"
+    bad = {
+        "": "'' is empty",
+        "\x1b[2J": printable,
+        "a\nb": printable,
+        "x" * 65: r"is too long \(65 characters\); use 1 to 64",
+    }
+    for name, problem in bad.items():
+        with pytest.raises(ValueError, match=problem):
             kind(**GOOD[kind], id=name)
 
 

@@ -13,7 +13,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.wire.marks import Mark, StopAt
 from trirail.wire.sizes import MAX_NAME
-from trirail.wire.text import ID_RULE, is_id, quoted
+from trirail.wire.text import check_id
 
 Identifier = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
 # These bounds exceed the range of every robot, but are far below the magnitudes at which doubles lose precision.
@@ -32,14 +32,14 @@ Tool = tuple[Coordinate, Coordinate] | FrameName
 
 
 def check_fields(message: Struct) -> None:
-    """Raise ValueError if the id is not printable or if a number is not finite.
+    """Raise ValueError if the id is invalid or if a number is not finite.
 
     Messages call this function when they are created, so that the checks also apply to messages that were not decoded.
     """
     for name in message.__struct_fields__:
         value = getattr(message, name)
-        if name == "id" and isinstance(value, str) and not is_id(value):
-            raise ValueError(f"id {quoted(value)!r} is not printable; use {ID_RULE}")
+        if name == "id" and isinstance(value, str):
+            check_id(value, "id")
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float) and not math.isfinite(number):
                 raise ValueError(f"{name}: {number} is not a finite number")

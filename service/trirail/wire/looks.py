@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goal_kind import Coordinate, Coordinates, Identifier, check_fields
 from trirail.wire.sizes import MAX_TEXT
-from trirail.wire.text import ID_RULE, is_id, quoted
+from trirail.wire.text import check_id
 
 MAX_MARKS = 32
 """Maximum number of marks in one look. With the longest names, this many marks take 6 kB."""
@@ -50,8 +50,7 @@ class SeenMark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=Tr
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if not is_id(self.name):
-            raise ValueError(f"mark {quoted(self.name)!r} is not printable; use {ID_RULE}")
+        check_id(self.name, "mark")
 
 
 class LookError(Struct, frozen=True, forbid_unknown_fields=True):

@@ -23,7 +23,7 @@ NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
 NAME_RULE = f"at most {MAX_NAME} letters, digits, - and _"
 QUANTITY_RULE = "reads as a number or a quantity; choose a name such as p5mm"
-ID_RULE = f"at most {MAX_NAME} characters, without control and formatting characters"
+ID_RULE = f"1 to {MAX_NAME} characters, without control and formatting characters"
 
 
 _WITH_COMMA = re.compile(r"\s*[-+]?[0-9]+,[0-9]+(?![0-9,.])")
@@ -55,6 +55,14 @@ def is_quantity(name: str) -> bool:
 def is_id(text: str) -> bool:
     """Return True if a text is a valid id of a goal."""
     return 0 < len(text) <= MAX_NAME and not any(map(_is_hidden, text))
+
+
+def check_id(text: str, whose: str) -> None:
+    """Raise ValueError if a text is not a valid id. `whose` tells the error message what is named, such as "mark"."""
+    if not is_id(text):
+        too_long = f"is too long ({len(text)} characters)"
+        problem = "is empty" if not text else too_long if len(text) > MAX_NAME else "is not printable"
+        raise ValueError(f"{whose} {quoted(text)!r} {problem}; use {ID_RULE}")
 
 
 def printable(text: str) -> str:
