@@ -8,7 +8,7 @@ import re
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from trirail.quantities import apart, beyond, worded
+from trirail.quantities import apart, apart_from_limit, beyond, rounded_inwards, worded
 
 UNITS = {unit + per: size for unit, size in (("m", 1e3), ("rad", 180.0 / math.pi)) for per in ("", "/s", "/s²", "/s³")}
 values = st.floats(-1e3, 1e3)
@@ -71,3 +71,20 @@ def test_what_is_beyond_a_limit_says_so_without_a_row_of_digits(limit: float, mo
 )
 def test_what_is_hardly_beyond_says_by_how_much(value: float, limit: float, unit: str, said: str) -> None:
     assert beyond("p", value, limit, unit) == said
+
+
+@example(2.30066e-6, 2e-3, -1.0)
+@given(st.floats(1e-6, 1.0), st.floats(1e-9, 10.0), st.sampled_from((-1.0, 1.0)))
+def test_a_value_is_seen_to_exceed_its_limit(limit: float, excess: float, sign: float) -> None:
+    shown = apart_from_limit(sign * limit * (1.0 + excess), limit, "m")
+    error, most = (float(each.removesuffix(" mm")) for each in shown)
+    assert sign * error > most > 0.0
+
+
+@example(2.0 * math.pi, 6)
+@given(st.floats(-1e12, 1e12), st.integers(3, 10))
+def test_a_rounded_bound_is_within_the_bound(bound: float, digits: int) -> None:
+    for low in (False, True):
+        rounded = float(f"{rounded_inwards(bound, digits, low=low):.{digits}g}")
+        assert rounded >= bound if low else rounded <= bound
+        assert rounded == pytest.approx(bound, rel=10.0 ** (1 - digits))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from typing import Final
 
 DISPLAY_UNITS: Final = {"m": (" mm", 1e3), "rad": ("°", 180.0 / math.pi)}
@@ -42,6 +43,18 @@ def beyond(name: str, value: float, limit: float, unit: str) -> str:
             f"{worded(limit, unit)}"
         )
     return f"{name} {worded(value, unit)} is beyond the limit of {worded(limit, unit)}"
+
+
+def apart_from_limit(value: float, limit: float, unit: str) -> tuple[str, str]:
+    """Format a value of either sign and the limit of its magnitude, as `apart` does."""
+    shown, most = apart(value, math.copysign(limit, value), unit)
+    return shown, most.removeprefix("-")
+
+
+def rounded_inwards(bound: float, digits: int, *, low: bool) -> float:
+    """Round a lower bound up, if `low`, or an upper bound down, so that the rounded number is also within the bound."""
+    rounding = ROUND_CEILING if low else ROUND_FLOOR
+    return float(Context(prec=digits, rounding=rounding).create_decimal(Decimal(repr(bound))))
 
 
 _WHOLE_TOLERANCE: Final = 1e-6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
@@ -33,6 +34,7 @@ from trirail.config import (
     wrong_values,
 )
 from trirail.config.impossible import check
+from trirail.config.loading import parse_values
 from trirail.config.tables import LegTable
 from trirail.errors import ConfigError, KinematicsError
 from trirail.kinematics.robot import forward, inverse
@@ -41,6 +43,7 @@ from trirail.motion.backlash_reserve import planned_limits
 from trirail.motion.limits import Bounds
 from trirail.telemetry import provenance
 from trirail.wire.goals import PoseGoal
+from trirail.wire.text import printable
 from trirail.wire.vocabulary import Mode
 from trirail.workspace.singularity import distance_to_singularity
 from trirail.workspace.violations import violations
@@ -196,7 +199,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         (
             "[loop]",
             "[frames.work]\npart = [0.1, 0.0, 9.0]\n[loop]",
-            "frames.work.part[2] = 9.0: expected number, -6.28319 to 6.28319",
+            "frames.work.part[2] = 9.0: expected number, -6.28318 to 6.28318",
         ),
         (
             "[loop]",
@@ -918,3 +921,129 @@ def test_a_path_may_begin_with_the_home_folder(
     monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
     with pytest.raises(ConfigError, match="~/x: the home folder is unknown: set HOME, or write the path without ~"):
         load(tmp_path / "robot.toml")
+
+
+@pytest.mark.parametrize("key", ["telemetry.directory", "correction.map", "drives.B.eds", "zenoh.tls.directory"])
+def test_a_home_folder_that_is_unknown_hides_no_other_mistake(key: str, tmp_path: Path) -> None:
+    table, name = key.rsplit(".", 1)
+    path = f'{name} = "~nobody_here/x"'
+    text = TEXT.replace("rate_hz = 1000", "rate_hz = 7")
+    if f"[{table}]" in text:
+        text = text.replace('directory = "recordings"', "") if table == "telemetry" else text
+        text = text.replace(f"[{table}]", f"[{table}]\n{path}", 1)
+    else:
+        text += f"\n[{table}]\n{path}\n"
+    (tmp_path / "robot.toml").write_text(text)
+    found = {each.key: each.text for each in everything(tmp_path / "robot.toml").mistakes}
+    assert {key, "loop.rate_hz"} <= set(found)
+    assert found[key].startswith(f"{key}: ~nobody_here/x: the home folder is unknown")
+    with pytest.raises(ConfigError, match=re.escape(f"{key}: ~nobody_here/x")):
+        load(tmp_path / "robot.toml")
+
+
+_ODD_NUMBERS = st.sampled_from(
+    (
+        f"1{'0' * 400}",
+        f"-1{'0' * 400}",
+        f"0x{'f' * 5000}",
+        "9" * 5000,
+        str(2**63),
+        "1e400",
+        "nan",
+        "07:32:00",
+        "[]",
+        "{}",
+        '"map.toml"',
+        "true",
+    )
+)
+_ODD_KEYS = st.sampled_from(('"a\\nb"', '"\\u001b[31mred"', '"\\u202e"', '""', f'"{"x" * 10_000}"'))
+_DEPTHS = st.sampled_from((100, 300, 450, 600, 900, 2000))
+_KEYS_OF_SIM = sorted({(key, part) for key, _, part in (line.partition(" = ") for line in TEXT.splitlines()) if part})
+
+
+@st.composite
+def odd_files(draw: st.DrawFn) -> str:
+    """Draw a file that is TOML, or nearly, but that nobody would write on purpose."""
+    key, part = draw(st.sampled_from(_KEYS_OF_SIM))
+    value = draw(_ODD_NUMBERS)
+    kind = draw(st.integers(0, 5))
+    depth = draw(_DEPTHS)
+    if kind == 0:
+        return TEXT.replace(f"{key} = {part}", f"{key} = {value}", 1)
+    if kind == 1:
+        return TEXT.replace(f"{key} = {part}", f"{key} = [{value}, {value}]", 1)
+    if kind == 2:
+        return TEXT + draw(
+            st.sampled_from((f"\n[{'.'.join('a' * depth)}]\n", f"\n[can.options]\n{'.'.join('a' * depth)} = 1\n"))
+        )
+    if kind == 3:
+        return TEXT.replace(f"{key} = {part}", f"{key} = {'[' * depth}{']' * depth}", 1)
+    if kind == 4:
+        table = draw(st.sampled_from(("", "[can.options]", "[poses]", "[zenoh.users]", "[frames.work]")))
+        return f"{TEXT}\n{table}\n{draw(_ODD_KEYS)} = {value}\n" if table else f"{draw(_ODD_KEYS)} = {value}\n{TEXT}"
+    name, example = draw(st.sampled_from(_SECTIONS))
+    return f"{TEXT}\n[{name}]\n{example} = {value}\n"
+
+
+_SECTIONS = (
+    ("correction", "as_built"),
+    ("correction.as_built", "made"),
+    ("correction.as_built", "nodes"),
+    ("correction", "map"),
+    ("drives.A.homing", "method"),
+    ("outputs.valve", "bit"),
+    ("frames.tools", "pin"),
+    ("can.options", "x"),
+    ("poses", "pick"),
+)
+
+
+@settings(max_examples=300)
+@example(f'{TEXT}\n[correction]\nas_built = "map.toml"\n')
+@example(f"{TEXT}\n[{'.'.join('a' * 600)}]\n")
+@example(TEXT.replace("x = [-0.15, 0.15]", f"x = [-0.15, 1{'0' * 400}]"))
+@example(TEXT.replace("rate_hz = 1000", f"rate_hz = 0x{'f' * 5000}"))
+@example(f'{TEXT}\n"a\\nb" = 1\n')
+@given(odd_files())
+def test_odd_files_are_refused_in_one_line_or_accepted(text: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.toml"
+        path.write_text(text)
+        refused = ""
+        try:
+            load(path)
+        except ConfigError as error:
+            refused = str(error)
+        try:
+            said = [each.text for each in everything(path).mistakes]
+        except ConfigError as error:
+            said = [str(error)]
+    assert bool(refused) == bool(said)
+    assert all(printable(words) == words for words in (refused, *said))
+
+
+def test_a_bound_that_is_stated_is_accepted() -> None:
+    """2 pi, rounded to six digits, is above 2 pi."""
+    with pytest.raises(ConfigError, match="expected number") as refused:
+        parse(SIM.with_name("uvw.toml").read_text().replace("rail_angle = 0.0", "rail_angle = 6.3", 1))
+    bounds = re.search(r"expected number, (\S+) to ([^\s;]+)", str(refused.value))
+    assert bounds is not None
+    for bound in bounds.groups():
+        parse_values(SIM.with_name("uvw.toml").read_text().replace("rail_angle = 0.0", f"rail_angle = {bound}", 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"), [("socketcna", 'did you mean "socketcan"? Use one of '), ("ethernet", "unknown; use one of ")]
+)
+def test_an_interface_that_does_not_exist_is_refused_with_those_that_do(name: str, hint: str) -> None:
+    text = TEXT.replace('interface = "simulated"', f'interface = "{name}"')
+    with pytest.raises(ConfigError, match=re.escape(f'can.interface "{name}" is unknown')) as refused:
+        parse(text)
+    assert hint in str(refused.value)
+
+
+def test_a_map_that_is_written_at_the_wrong_key_is_one_mistake(tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").write_text(f'{TEXT}\n[correction]\nas_built = "map.toml"\n')
+    found = everything(tmp_path / "robot.toml").mistakes
+    assert [each.text for each in found] == ["correction.as_built = 'map.toml': expected table"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -326,10 +327,17 @@ class TestConfigure:
     def test_period_as_value_and_power_of_ten(self, rate: float, said: tuple[int, int]) -> None:
         assert interpolation_periods(1 / rate)[0] == said
 
-    @pytest.mark.parametrize("rate", [300, 3000, 700])
+    @pytest.mark.parametrize("rate", [16, 32, 64, 160, 300, 320, 700, 1600, 3000])
     def test_period_that_no_drive_can_be_told(self, rate: float) -> None:
-        with pytest.raises(DriveError, match=r"60C2h .*the nearest is .* Hz\)"):
+        """The remedy is a rate that a file may have, and that drives can be told."""
+        with pytest.raises(DriveError, match=r"60C2h .*set loop\.rate_hz = \d+, the nearest") as refused:
             interpolation_periods(1 / rate)
+        remedy = re.search(r"rate_hz = (\d+)", str(refused.value))
+        assert remedy is not None
+        nearest = int(remedy[1])
+        assert 1_000_000 % nearest == 0
+        assert interpolation_periods(1 / nearest)
+        assert nearest / 2 < rate < 2 * nearest
 
 
 class TestPower:

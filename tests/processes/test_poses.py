@@ -549,7 +549,7 @@ def test_travels_are_those_of_the_inverse_kinematics(pose: tuple[float, float, f
     [
         ("park = [0.5, 0.0, 0.0]", "poses.park = [0.5, 0, 0]: x would be 0.5, outside limits.platform.x = [-0.15, "),
         ("park = [0.0, 0.0]", "poses.park = [0.0, 0.0]: expected array of length 3"),
-        ("park = [0.0, 0.0, 9.0]", "poses.park[2] = 9.0: expected number, -6.28319 to 6.28319"),
+        ("park = [0.0, 0.0, 9.0]", "poses.park[2] = 9.0: expected number, -6.28318 to 6.28318"),
         ("'my pose' = [0.0, 0.0, 0.0]", "poses: 'my pose' is not a valid name here: expected text matching"),
         ("park = [0.0, 0.0, nan]", "poses.park[2] = nan: it must be a finite number"),
     ],

@@ -24,20 +24,25 @@ def interpolation_periods(period: float) -> list[tuple[int, int]]:
 
     Raises DriveError if no pair equals the period.
     """
-    candidates = [
+    if candidates := _value_and_exponents(period):
+        return sorted(candidates, key=lambda each: (each[1] != PREFERRED_EXPONENT, -each[1]))
+    rates = (2**twos * 5**fives for twos in range(7) for fives in range(7))  # their cycles are whole microseconds
+    possible = [rate for rate in rates if _value_and_exponents(1.0 / rate)]
+    nearest = min(possible, key=lambda rate: abs(math.log(rate * period)))
+    raise DriveError(
+        f"a cycle of {period:g} s ({1 / period:g} Hz) is not possible: object 60C2h accepts "
+        f"1 to 255 times a power of ten, from 1 us; set loop.rate_hz = {nearest}, the nearest"
+    )
+
+
+def _value_and_exponents(period: float) -> list[tuple[int, int]]:
+    """Return the pairs of a value and an exponent of ten for object 60C2h that equal `period` [s]."""
+    return [
         (round(period * 10**-exponent), exponent)
         for exponent in range(0, -7, -1)
         if math.isclose(round(period * 10**-exponent) * 10.0**exponent, period, rel_tol=1e-9)
         and 1 <= round(period * 10**-exponent) <= 255
     ]
-    if candidates:
-        return sorted(candidates, key=lambda each: (each[1] != PREFERRED_EXPONENT, -each[1]))
-    finest = max(-6, math.ceil(math.log10(period / 255)))
-    nearest = max(1, round(period * 10**-finest)) * 10.0**finest
-    raise DriveError(
-        f"a cycle of {period:g} s ({1 / period:g} Hz) is not possible: object 60C2h accepts "
-        f"1 to 255 times a power of ten, from 1 us; the nearest is {nearest:g} s ({1 / nearest:g} Hz)"
-    )
 
 
 def check_nodes(drives: Drives) -> None:

@@ -15,8 +15,9 @@ from msgspec import inspect as mi
 from trirail_drivers.config import NO_LINE_BREAK, Coordinate
 
 from trirail.config.tables import Angle, Config, ShapeError
-from trirail.quantities import as_familiar_unit
+from trirail.quantities import as_familiar_unit, rounded_inwards
 from trirail.wire.decoding import converted
+from trirail.wire.text import printable, quoted
 
 Place = tuple[str | int, ...]
 """Position of a value in nested tables and arrays, as names and indices."""
@@ -93,6 +94,10 @@ def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_Wrong
     if isinstance(value, float) and not math.isfinite(value):
         yield _WrongValue(place, f"{_key(place)} = {value}: it must be a finite number", kind)
         return
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        text = f"{_key(place)}: integers in TOML have at most 64 bits; expected {expected(kind)}"
+        yield _WrongValue(place, text, kind)
+        return
     match kind, value:
         case mi.Metadata(type=inner), _:
             for wrong in _wrong_values(value, inner, place):
@@ -149,7 +154,7 @@ def _wrong_fields(table: dict[str, Any], kind: mi.StructType, place: Place) -> I
             if isinstance(cause, ShapeError):
                 yield _unexpected(table[cause.field], fields[cause.field].type, (*place, cause.field))
             else:
-                yield _WrongValue(place, f"{_key(place)} = {table}: {cause}", kind)
+                yield _WrongValue(place, f"{_key(place)} = {_shown(table)}: {cause}", kind)
 
 
 def _wrong_names(table: dict[str, Any], kind: mi.DictType, place: Place) -> Iterator[_WrongValue]:
@@ -158,7 +163,7 @@ def _wrong_names(table: dict[str, Any], kind: mi.DictType, place: Place) -> Iter
         if _accepts(kind.key_type, name):
             yield from _wrong_values(value, kind.value_type, (*place, name))
         else:
-            text = f"{_key(place)}: {name!r} is not a valid name here: expected {expected(kind.key_type)}"
+            text = f"{_key(place)}: {quoted(name)!r} is not a valid name here: expected {expected(kind.key_type)}"
             yield _WrongValue((*place, name), text, None)
 
 
@@ -205,8 +210,16 @@ def _fits(length: int, kind: mi.StrType | mi.VarTupleType) -> bool:
 
 def _unexpected(value: object, kind: mi.Type, place: Place) -> _WrongValue:
     """Return a message with the value at a position and the values that its type accepts."""
-    text = f"{_key(place)} = {value!r}: expected {expected(kind)}{_other_unit(value, kind)}"
+    text = f"{_key(place)} = {_shown(value)}: expected {expected(kind)}{_other_unit(value, kind)}"
     return _WrongValue(place, text, kind)
+
+
+def _shown(value: object) -> str:
+    """Return a value in one line. An integer in a table or an array may have more digits than Python writes."""
+    try:
+        return quoted(repr(value))
+    except ValueError:
+        return "…"
 
 
 def expected(kind: mi.Type) -> str:
@@ -243,10 +256,15 @@ def expected(kind: mi.Type) -> str:
 def bounds(kind: mi.IntType | mi.FloatType) -> str:
     """Return the bounds of a number in words that can follow the name of its type."""
     digits = 10 if isinstance(kind, mi.IntType) else 6
-    if kind.ge is not None and kind.le is not None:
-        return f", {kind.ge:.{digits}g} to {kind.le:.{digits}g}"
     signs = {">": kind.gt, "≥": kind.ge, "<": kind.lt, "≤": kind.le}
-    return " and".join(f" {sign} {bound:.{digits}g}" for sign, bound in signs.items() if bound is not None)
+    shown = {
+        sign: f"{rounded_inwards(bound, digits, low=sign in '>≥'):.{digits}g}"
+        for sign, bound in signs.items()
+        if bound is not None
+    }
+    if shown.keys() == {"≥", "≤"}:
+        return f", {shown['≥']} to {shown['≤']}"
+    return " and".join(f" {sign} {bound}" for sign, bound in shown.items())
 
 
 _UNITS: Final = (
@@ -264,7 +282,7 @@ def _other_unit(value: object, kind: mi.Type) -> str:
     return ""
 
 
-_POSSIBLE: Final[tuple[object, ...]] = (1, 0.5, 0, 10, 1000, 50_000, True, "x", "605A", "counts/s")
+_POSSIBLE: Final[tuple[object, ...]] = (1, 0.5, 0, 10, 1000, 50_000, True, "x", "605A", "counts/s", "0" * 8)
 """Candidate values. Every key that is neither a table nor an array accepts at least one of them."""
 
 
@@ -299,4 +317,4 @@ def _at(place: Place, raw: Any) -> Any:
 
 def _key(place: Place) -> str:
     """Return a position in the notation that people use, such as limits.platform.x[0]."""
-    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+    return printable("".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip("."))

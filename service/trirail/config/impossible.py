@@ -100,7 +100,7 @@ def rules(config: Config) -> Iterator[Rule]:
     for key, both in ranges.items():
         if key != "limits.platform.phi":
             yield Rule(key, ("geometry",), partial(_check_metres, config, key, *both))
-    yield Rule("correction.map", ("geometry", "limits"), partial(_check_correction, config))
+    yield Rule("correction.map", ("geometry", "limits", "correction.as_built"), partial(_check_correction, config))
     yield Rule("correction.backlash", ("limits.slider.position",), partial(_check_backlash, config))
     reads = "limits.platform.x", "limits.platform.y", "limits.singularity_margin", "geometry", "correction"
     yield Rule("limits.platform.phi", reads, partial(_check_singular_angles, config))

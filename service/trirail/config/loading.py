@@ -12,15 +12,18 @@ from trirail_drivers.errors import FileError
 from trirail_drivers.interface import NAMES
 
 from trirail.config import as_built
-from trirail.config.explained import Mistake, leaves, repaired
+from trirail.config.explained import Mistake, repaired
 from trirail.config.impossible import check, mistakes
 from trirail.config.tables import Config, FramesTable, Limits, resolved
 from trirail.errors import ConfigError
 from trirail.wire.decoding import prepare
+from trirail.wire.text import printable
 
 _PACKAGED = Path(__file__).parents[1] / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[3] / "configs") / "sim.toml"
 """Default configuration. Its drives are simulated, so it needs no hardware, no special rights and no other program."""
+MAX_DEPTH = 32
+"""Greatest number of tables and arrays inside each other, several times that of any valid file."""
 prepare(Config, Limits, FramesTable)
 
 
@@ -100,13 +103,21 @@ def toml_tables(text: str) -> dict[str, Any]:
     """Parse TOML into tables. Raises ConfigError if it is invalid."""
     try:
         raw = tomllib.loads(text)
-        for _ in leaves(raw):
-            pass
+        _check_depth(raw, MAX_DEPTH)
     except RecursionError as error:
         raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
     except ValueError as error:  # TOMLDecodeError, or int() on thousands of digits
-        raise ConfigError(f"not TOML: {error}") from error
+        raise ConfigError(f"not TOML: {printable(str(error))}") from error
     return raw
+
+
+def _check_depth(value: object, most: int) -> None:
+    """Raise RecursionError if tables and arrays are nested deeper than `most`."""
+    if isinstance(value, dict | list):
+        if most == 0:
+            raise RecursionError
+        for inner in value.values() if isinstance(value, dict) else value:
+            _check_depth(inner, most - 1)
 
 
 def _resolve_paths(path: Path, config: Config, wrong: list[Mistake]) -> Config:
@@ -114,20 +125,33 @@ def _resolve_paths(path: Path, config: Config, wrong: list[Mistake]) -> Config:
 
     Paths are relative to the configuration file.
     """
+
+    def resolve(key: str, value: str) -> str:
+        try:
+            return resolved(value, path.parent)
+        except ConfigError as error:
+            wrong.append(Mistake(key, f"{key}: {error}"))
+            return value
+
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
         named = {key: getattr(drive, key) for key in ("eds", "endpoints")}
-        files_of = {key: resolved(file, path.parent) for key, file in named.items() if file is not None}
+        files_of = {key: resolve(f"drives.{name}.{key}", file) for key, file in named.items() if file is not None}
         drives = msgspec.structs.replace(drives, **{name: msgspec.structs.replace(drive, **files_of)})
     correction = config.correction
     if correction.map is not None and correction.as_built is None:
-        file = resolved(correction.map, path.parent)
+        count, file = len(wrong), resolve("correction.map", correction.map)
         try:
-            correction = msgspec.structs.replace(correction, map=file, as_built=as_built.read(Path(file)))
+            if len(wrong) == count:
+                correction = msgspec.structs.replace(correction, map=file, as_built=as_built.read(Path(file)))
         except ConfigError as error:
             wrong.append(Mistake("correction.map", f"correction.map: {error}"))
     telemetry = config.telemetry
     if not path.resolve().is_relative_to(SIM.parent):  # recordings are never written next to the shipped files
-        telemetry = msgspec.structs.replace(telemetry, directory=resolved(telemetry.directory, path.parent))
-    zenoh = config.zenoh.beside(path.parent)
+        telemetry = msgspec.structs.replace(telemetry, directory=resolve("telemetry.directory", telemetry.directory))
+    zenoh = config.zenoh
+    try:
+        zenoh = zenoh.beside(path.parent)
+    except ConfigError as error:
+        wrong.append(Mistake("zenoh.tls.directory", f"zenoh.tls.directory: {error}"))
     return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction, telemetry=telemetry)
