@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import logging
 import time
@@ -44,9 +45,7 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
         return simulated_bus(section, drives, clock)
     if section.interface == "unix":
         return UnixBus(section.channel, fd=section.fd)
-    if section.interface not in can.VALID_INTERFACES:
-        known = ", ".join(sorted({"simulated", "unix", *can.VALID_INTERFACES}))
-        raise BusError(f'can.interface "{section.interface}" is unknown; use one of {known}')
+    check_interface(section)
     if section.fd and section.interface != "socketcan":
         raise BusError(no_fd(section))
     options: dict[str, Any] = dict(section.options)
@@ -69,6 +68,15 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
         bus.shutdown()
         raise BusAbsentError(problem)
     return bus
+
+
+def check_interface(section: config.Can) -> None:
+    """Raise BusError if there is no interface of the configured name."""
+    known = sorted({"simulated", "unix", *can.VALID_INTERFACES})
+    if section.interface not in known:
+        close = difflib.get_close_matches(section.interface, known, n=1)
+        hint = f'did you mean "{close[0]}"? Use' if close else "use"
+        raise BusError(f'can.interface "{section.interface}" is unknown; {hint} one of {", ".join(known)}')
 
 
 def no_fd(section: config.Can) -> str:

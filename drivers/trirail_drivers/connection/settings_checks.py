@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from functools import partial
 
 from trirail_drivers.config import Can, Drives
-from trirail_drivers.connection.opening import no_fd
+from trirail_drivers.connection.opening import check_interface, no_fd
 from trirail_drivers.driver.requirements import Requirements, Rule
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
@@ -21,9 +21,10 @@ MAX_CLASSICAL_BITRATE = 1_000_000
 
 
 def bus_rules(section: Can, protocol: str) -> Iterator[Rule]:
-    """Yield checks for a bit rate above that of classical CAN, for CAN FD where it is not possible, and for options
-    that python-can does not accept.
+    """Yield checks for an unknown interface, for a bit rate above that of classical CAN, for CAN FD where it is not
+    possible, and for options that python-can does not accept.
     """
+    yield Rule("can.interface", (), partial(check_interface, section))
     yield Rule("can.bitrate", ("can.interface",), partial(_check_bitrate, section))
     yield Rule("can.fd", ("can.interface", "drives.protocol"), partial(_check_fd, section, protocol))
     yield Rule("can.data_bitrate", ("can.fd", "can.bitrate"), partial(_check_data_bitrate, section))
