@@ -325,7 +325,7 @@ class Odrive(Driver[OdriveAxis]):
                 return axis.make_fault(
                     "fault",
                     0,
-                    f"following error {error * 1e3:.3f} mm exceeds its window of "
+                    f"following error {error * 1e3:.9g} mm exceeds its window of "
                     f"{self._drives.following_error * 1e3:g} mm",
                 )
         return None

@@ -14,6 +14,7 @@ from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, T
 from trirail.commissioning.moves import MAX_VELOCITY, SlowMove
 from trirail.config import Config
 from trirail.kinematics.arrays import Array
+from trirail.quantities import apart_from_limit
 
 MAX_FOLLOWING_ERROR_M: Final = 0.0003
 """Following error of a powered slider above which all drives are stopped [m].
@@ -321,8 +322,8 @@ class Bench:
                 self.max_errors[index] = max(self.max_errors[index], abs(error))
                 if not abs(error) <= MAX_FOLLOWING_ERROR_M:  # also true if the error is NaN
                     slider = f"slider {self._labels[index]}"
-                    limit = MAX_FOLLOWING_ERROR_M * 1e3
-                    return f"{slider}: following error {error * 1e3:.3f} mm exceeds the limit of {limit:g} mm"
+                    shown, most = apart_from_limit(error, MAX_FOLLOWING_ERROR_M, "m")
+                    return f"{slider}: following error {shown} exceeds the limit of {most}"
         return ""
 
     def _describe(self, reason: str = "") -> str:

@@ -37,6 +37,7 @@ from trirail.motion.rules import RULES
 from trirail.motion.runs import ZERO_RATES, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames
+from trirail.quantities import apart_from_limit
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.marks import StopAt
 from trirail.wire.messages import FaultDetail, Notice, Outcome
@@ -334,7 +335,8 @@ class Control:
             if behind:
                 error, limit = self.measured.following_error[behind - 1], self._following_error_limit
                 slider = self._labels[behind - 1]
-                words = f"slider {slider}: following error {error * 1e3:.3f} mm exceeds the limit of {limit * 1e3:g} mm"
+                shown, most = apart_from_limit(error, limit, "m")
+                words = f"slider {slider}: following error {shown} exceeds the limit of {most}"
                 text = coded(words, EventCode.FOLLOWING_ERROR, slider=slider, value=error, limit=limit)
                 self.modes.trip(text, FaultCause.FOLLOWING_ERROR, NAMES[behind - 1])
             elif not feedback.homing:
