@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import copy
 import math
+import random
+import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 import tomlkit
+from control_rig import ControlRig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.cli import rail_drawing
@@ -20,7 +24,11 @@ from trirail.config.explained import Place, leaves, repaired
 from trirail.config.impossible import rules
 from trirail.diagnosis import Check, diagnose, failed_checks, stops
 from trirail.diagnosis.configured import CONFIG_CHECKS
+from trirail.diagnosis.stopping import each_stops
 from trirail.errors import TrirailError
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
+from trirail.wire.packets import Accepted
+from trirail.wire.vocabulary import Mode
 from trirail_drivers.errors import MAX_MESSAGE_LENGTH
 
 FILES = sorted(SIM.parent.rglob("*.toml"))
@@ -313,24 +321,65 @@ def test_a_zero_is_compared_with_the_travel_of_its_own_slider() -> None:
     assert found(0.0) == {"drives.A.offset"}
 
 
-@given(v=st.floats(1e-3, 10.0), a=st.floats(0.01, 100.0), j=st.floats(0.1, 1e5), q=st.floats(0.01, 100.0))
-def test_stops_are_those_of_the_motion_itself(v: float, a: float, j: float, q: float) -> None:
-    """A controlled stop, integrated: jerk -j until -a is reached or half of v is gone, then -a, then j."""
-    config = load(SIM)
-    slider = msgspec.structs.replace(config.limits.slider, velocity=v, acceleration=a, jerk=j)
-    limits = msgspec.structs.replace(config.limits, slider=slider)
-    drives = msgspec.structs.replace(config.drives, quick_stop_deceleration=q)
-    found = stops(msgspec.structs.replace(config, limits=limits, drives=drives))
-    ramp = min(a / j, math.sqrt(v / j))
-    steady = max(0.0, v - j * ramp * ramp) / (j * ramp)
-    way, speed, rate = 0.0, v, 0.0
-    for jerk, time in ((-j, ramp), (0.0, steady), (j, ramp)):
-        way += speed * time + rate * time**2 / 2.0 + jerk * time**3 / 6.0
-        speed += rate * time + jerk * time**2 / 2.0
-        rate += jerk * time
-    assert speed == pytest.approx(0.0, abs=1e-9 * max(v, 1.0))
-    assert (found.way, found.time) == pytest.approx((way, 2.0 * ramp + steady), rel=1e-6)
-    assert (found.quick_way, found.quick_time) == pytest.approx((v / q * v / 2.0, v / q))
+@pytest.mark.generated(*range(16))
+def test_a_stop_of_the_control_is_no_longer_than_stated(seed: int) -> None:
+    """At constant velocity on a line, by any limits, and at any override."""
+    chance = random.Random(seed)
+    config = load(SIM.with_name(chance.choice(("sim.toml", "socketcan.toml", "uvw.toml", "xxy.toml"))))
+
+    def spread(limits: Sequence[float], share: float = 1.0) -> tuple[float, ...]:
+        return tuple(share * limit * math.exp(chance.uniform(-1.2, 1.2)) for limit in limits)
+
+    change = msgspec.structs.replace
+    slider, platform = config.limits.slider, config.limits.platform
+    slider = change(
+        slider,
+        velocity=spread(slider.velocities, 0.3),
+        acceleration=spread(slider.accelerations),
+        jerk=spread(slider.jerks),
+    )
+    rates = {key: spread(getattr(platform, key)) for key in ("velocity", "acceleration", "jerk")}
+    limits = change(config.limits, slider=slider, platform=change(platform, **rates))
+    backlash = chance.choice(((0.0, 0.0, 0.0), (2e-6, 1e-6, 3e-6)))
+    correction = change(config.correction, backlash=backlash)
+    simulated = change(config.can, interface="simulated")
+    config = change(config, limits=limits, correction=correction, can=simulated)
+    every = each_stops(config)
+    rig = ControlRig(config)
+    rig.enable()
+    for number in range(12):
+        rig.command("override", chance.choice((0.5, 1.0, 2.0)))
+        x, y, phi = (chance.uniform(*ends) for ends in (platform.x, platform.y, platform.phi))
+        a, b, c = (chance.uniform(*ends) for ends in slider.positions)
+        goals: tuple[Goal, ...] = PoseGoal(x, y, phi, speed=chance.choice((0.5, 1.0))), SlidersGoal((a, b, c))
+        answer = rig.send(f"g{number}", chance.choice(goals), within=40_000)
+        if not isinstance(answer, Accepted):
+            continue
+        while rig.mode is Mode.MOVING and not _is_constant(rig, every[0].time):
+            rig.cycle()
+        if rig.mode is Mode.MOVING:
+            (run,) = rig.control.schedule.runs
+            rate = run.law_state.rate
+            rig.order("stop")
+            while run.law_state.rate == rate:
+                rig.cycle()
+            begun = len(rig.rows) - 2
+            rig.until(rig.holds, 40_000)
+            ways = np.abs(np.ptp(rig.setpoints()[begun:, 0], axis=0))
+            assert all(way <= stop.way + max(backlash) for way, stop in zip(ways, every, strict=True)), (ways, every)
+            assert (len(rig.rows) - begun - 4) * config.period <= every[0].time
+        rig.until(rig.holds, 40_000)
+
+
+def _is_constant(rig: ControlRig, duration: float) -> bool:
+    """Return whether the motion under way keeps its velocity for a stop of this duration [s]."""
+    runs = rig.control.schedule.runs
+    if len(runs) != 1 or runs[0].law_state.change != 0.0:
+        return False
+    path, (s, rate, _) = runs[0].path, runs[0].law_state
+    piece = int(np.searchsorted(path.knots, s, side="right")) - 1
+    ends = 0 <= piece < len(path.pieces) and float(path.knots[piece + 1]) - s
+    return bool(ends > rate * (duration / 2.0 + 10.0 * rig.config.period) and not path.pieces[piece, :, 2:].any())
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
@@ -344,3 +393,68 @@ def test_the_rail_is_drawn(path: Path) -> None:
         return
     assert rows == ["rail", "travel", "stop", "quick stop"]
     assert found.rail == pytest.approx((-0.1732, 0.3464), abs=1e-4)
+
+
+@pytest.mark.parametrize("rate", [1, 2, 5, 8, 10, 20, 100, 1000])
+@pytest.mark.parametrize("key", ["drives.missed_positions", "watchdogs.max_overruns"])
+def test_a_remedy_is_a_value_that_removes_the_warning(rate: int, key: str) -> None:
+    section, name = key.split(".")
+    change = msgspec.structs.replace
+    config = change(load(SIM), loop=change(load(SIM).loop, rate_hz=rate))
+
+    def found(number: int) -> list[Check]:
+        tables = change(getattr(config, section), **{name: number})
+        return [each for each in diagnose(change(config, **{section: tables})) if each.key == key]
+
+    for check in found(10_000):
+        number = re.fullmatch(r"set at most (\d+)|set a higher loop\.rate_hz: .*", check.remedy)
+        assert number is not None, check.remedy
+        if number[1] is None:
+            assert found(1)
+        else:
+            assert int(number[1]) >= 1
+            assert found(int(number[1])) == []
+            assert found(int(number[1]) + 1)
+
+
+def in_position(config: Config, **fields: float) -> Config:
+    """Return a configuration with other fields of [limits.in_position]."""
+    settling = msgspec.structs.replace(config.limits.in_position, **fields)
+    return msgspec.structs.replace(config, limits=msgspec.structs.replace(config.limits, in_position=settling))
+
+
+@pytest.mark.parametrize("backlash", [0.0, 5e-6, 5e-5])
+@pytest.mark.parametrize("rate", [10, 1000])
+def test_a_time_out_without_a_warning_lets_goals_be_done(backlash: float, rate: int) -> None:
+    """The take-up of a reversal, the dwell and the age of a position fit into it, on perfect drives."""
+    change = msgspec.structs.replace
+    config = load(SIM)
+    slow = change(config.limits.slider, acceleration=0.05, jerk=1.0, velocity=0.05)
+    config = change(
+        config,
+        loop=change(config.loop, rate_hz=rate),
+        limits=change(config.limits, slider=slow),
+        correction=change(config.correction, backlash=(backlash,) * 3),
+    )
+
+    def told(timeout: float) -> list[Check]:
+        checks = diagnose(in_position(config, dwell=0.01, timeout=timeout))
+        return [each for each in checks if each.key == "limits.in_position.timeout"]
+
+    assert told(10.0) == []
+    (check,) = told(0.0101)
+    assert "limits.in_position.timeout" in check.found
+    assert ("correction.backlash" in check.found) == (backlash > 0.0)
+    stated = re.search(r"at least ([\d.]+)", check.remedy)
+    assert stated is not None
+    assert told(float(stated[1])) == []
+    outcomes = []
+    for timeout in (float(stated[1]), 0.0101):
+        rig = ControlRig(in_position(config, dwell=0.01, timeout=timeout))
+        rig.enable()
+        for number, x in enumerate((2e-5, 1e-5, 2e-5)):
+            assert isinstance(rig.goal(f"g{number}", x, 0.0, 0.0), Accepted)
+            rig.until(rig.holds)
+        outcomes.append({outcome for _, outcome in rig.outcomes()})
+    assert outcomes[0] == {"done"}
+    assert backlash == 0.0 or "unsettled" in outcomes[1]

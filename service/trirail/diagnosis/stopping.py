@@ -5,10 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+import numpy as np
 from msgspec import Struct
 
-from trirail.config import Config
+from trirail.config import Config, corrected_geometry
 from trirail.diagnosis.check import Check, ConfigCheck, format_value, is_simulated
+from trirail.kinematics.arrays import Array
+from trirail.kinematics.robot import jacobians
+from trirail.motion.backlash_reserve import planned_limits
+from trirail.motion.time_scaling import stop_duration
+from trirail.quantities import rounded_inwards
+
+
+REACHABLE_FACTOR = 2.0
+"""Factor by which the platform may be faster near the edge of its workspace than in the middle."""
+MOST_CONDITION = 1e9
+"""Greatest condition number of a matrix that is not treated as singular."""
 
 
 class Stops(Struct, frozen=True):
@@ -48,20 +60,30 @@ def stops(config: Config) -> Stops:
 def each_stops(config: Config) -> list[Stops]:
     """Return the stops of the sliders A, B, C.
 
-    A controlled stop from velocity v with acceleration limit a and jerk limit j takes the time t = v / a + a / j, or
-    t = 2 sqrt(v / j) if the acceleration does not reach a. The distance is v t / 2. A quick stop with deceleration q
-    takes the time v / q and the distance v² / 2q.
+    A controlled stop obeys the limits of all sliders and of the platform, and lasts equally long for every slider, see
+    stop_duration. A quick stop with deceleration q takes the time v / q and the distance v² / 2q.
     """
     slider, quick = config.limits.slider, config.drives.quick_stop_deceleration
     rail = None
     if config.geometry.l0 is not None:  # the rails are the sides of the paper's triangle, with 0 at a third of each
         third = config.geometry.l0 / math.sqrt(3.0)
         rail = -third, 2.0 * third
-    candidates = []
-    for v, a, j, travel in zip(slider.velocities, slider.accelerations, slider.jerks, slider.positions, strict=True):
-        time = v / a + a / j if v >= a * a / j else 2.0 * math.sqrt(v / j)
-        candidates.append(Stops(v, v * time / 2.0, time, v * v / (2.0 * quick), v / quick, travel, rail))
-    return candidates
+    time = stop_duration(planned_limits(config.limits, config.correction.backlash), _reachable(config))
+    return [
+        Stops(v, v * time / 2.0, time, v * v / (2.0 * quick), v / quick, travel, rail)
+        for v, travel in zip(slider.velocities, slider.positions, strict=True)
+    ]
+
+
+def _reachable(config: Config) -> Array:
+    """Return velocities of the platform in x, y, phi that the sliders do not let it exceed [m/s, rad/s], (3,).
+
+    They are those with all sliders at their limits in the middle of the workspace, with a factor for other poses.
+    """
+    j1, j2 = jacobians(corrected_geometry(config), (0.0, 0.0, 0.0))
+    if np.linalg.cond(j2) > MOST_CONDITION:
+        return np.full(3, np.inf)
+    return REACHABLE_FACTOR * np.abs(np.linalg.solve(j2, j1)) @ config.limits.slider.velocities
 
 
 def _rail(config: Config) -> Iterator[Check]:
@@ -88,7 +110,9 @@ def _rail(config: Config) -> Iterator[Check]:
         yield Check("rail", "ok", f"{ways}; {stop.left * 1e3:.3g} mm are left: enough for simulated drives")
     else:
         quick = stop.quick_way > stop.left
-        ramp = "drives.quick_stop_deceleration" if quick else "limits.slider.acceleration and jerk"
+        ramp = (
+            "drives.quick_stop_deceleration" if quick else "acceleration and jerk in limits.platform and limits.slider"
+        )
         finding = f"{ways}; {stop.left * 1e3:.3g} mm of rail are left beyond limits.slider.position"
         remedy = (
             f"lower limits.slider.velocity, end the travel {stop.longer * 1e3:.3g} mm before the rail, or raise {ramp}"
@@ -97,16 +121,22 @@ def _rail(config: Config) -> Iterator[Check]:
 
 
 def _travel(config: Config) -> Iterator[Check]:
-    """Check that a slider can reach its velocity limit and stop again within its travel."""
-    stop = stops(config)
-    travel = stop.travel[1] - stop.travel[0]
-    if 2.0 * stop.way > travel:
-        finding = (
-            f"acceleration to {stop.velocity * 1e3:g} mm/s and the stop from there take {stop.way * 1e3:.3g} mm each: "
-        )
-        finding += f"no motion within the travel of {travel * 1e3:.3g} mm reaches that velocity"
-        remedy = "set a lower limits.slider.velocity, or more acceleration and jerk"
-        yield Check("travel", "warning", finding, remedy, "limits.slider.velocity")
+    """Check that each slider can reach its velocity limit and brake again within its travel.
+
+    It needs the time t = v / a + a / j for each, or t = 2 sqrt(v / j) if the acceleration does not reach its limit a.
+    The distance is v t / 2. The platform's limits can make it longer.
+    """
+    slider = config.limits.slider
+    for v, a, j, (low, high) in zip(
+        slider.velocities, slider.accelerations, slider.jerks, slider.positions, strict=True
+    ):
+        way = v * (v / a + a / j if v >= a * a / j else 2.0 * math.sqrt(v / j)) / 2.0
+        if 2.0 * way > high - low:
+            finding = f"acceleration to {v * 1e3:g} mm/s and braking from there take at least {way * 1e3:.3g} mm each: "
+            finding += f"no motion within the travel of {(high - low) * 1e3:.3g} mm reaches that velocity"
+            remedy = "set a lower limits.slider.velocity, or more acceleration and jerk"
+            yield Check("travel", "warning", finding, remedy, "limits.slider.velocity")
+            return
 
 
 def _quick_stop(config: Config) -> Iterator[Check]:
@@ -120,8 +150,8 @@ def _quick_stop(config: Config) -> Iterator[Check]:
     if stop.quick_time > timeout:
         finding = f"from {stop.velocity * 1e3:g} mm/s it takes {stop.quick_time:.3g} s by {ramp}, longer than "
         finding += f"drives.stop_timeout = {timeout:g} s: power would be cut in motion, with a fault"
-        minimum = stop.velocity / timeout
-        remedy = f"set drives.quick_stop_deceleration above {minimum:.3g} m/s², or a longer drives.stop_timeout"
+        minimum = rounded_inwards(stop.velocity / timeout, 3, low=True)
+        remedy = f"set drives.quick_stop_deceleration above {minimum:g} m/s², or a longer drives.stop_timeout"
         yield Check("quick stop", "failure", finding, remedy, key)
     elif stop.quick_time < config.period:
         finding = f"from {stop.velocity * 1e3:g} mm/s it would take {stop.quick_time * 1e3:.2g} ms by {ramp}"
@@ -135,11 +165,10 @@ def _quick_stop(config: Config) -> Iterator[Check]:
         yield Check("quick stop", "ok", finding)
 
 
+_STOPS = "limits.slider", "limits.platform", "drives.quick_stop_deceleration", "geometry", "correction.backlash"
+"""Keys from which each_stops computes its result."""
 CONFIG_CHECKS = (
-    ConfigCheck(("limits.slider", "drives.quick_stop_deceleration", "geometry", "can"), _rail),
-    ConfigCheck(("limits.slider", "drives.quick_stop_deceleration", "geometry"), _travel),
-    ConfigCheck(
-        ("limits.slider", "drives.quick_stop_deceleration", "drives.stop_timeout", "geometry", "loop.rate_hz"),
-        _quick_stop,
-    ),
+    ConfigCheck((*_STOPS, "can"), _rail),
+    ConfigCheck(("limits.slider",), _travel),
+    ConfigCheck((*_STOPS, "drives.stop_timeout", "loop.rate_hz"), _quick_stop),
 )

@@ -10,6 +10,13 @@ from trirail_drivers.interface import NAMES
 
 from trirail.config import Config
 from trirail.diagnosis.check import Check, ConfigCheck
+from trirail.motion.backlash_reserve import reserve_for_backlash
+from trirail.quantities import rounded_inwards
+
+POSITION_DELAY_CYCLES = 3
+"""Number of cycles after which the positions of perfect drives are those of the last setpoint."""
+WHOLE_TOLERANCE = 1e-9
+"""Rounding error of a whole number of cycles."""
 
 
 class _Bounds(NamedTuple):
@@ -75,11 +82,35 @@ def _times(config: Config) -> Iterator[Check]:
         wrong = True
         setting = f"{key} = {number:g}" + ("" if number == time else f", {time:.3g} s")
         if time < low:
-            yield Check("times", "warning", f"{setting}: {shorter}", f"set at least {low * number / time:.3g}", key)
-        else:
-            yield Check("times", "warning", f"{setting}: {longer}", f"set at most {high * number / time:.3g}", key)
+            remedy = f"set at least {rounded_inwards(low * number / time, 3, low=True):g}"
+            yield Check("times", "warning", f"{setting}: {shorter}", remedy, key)
+            continue
+        most = rounded_inwards(high * number / time, 3, low=False)
+        if isinstance(number, int):  # a number of cycles
+            most = math.floor(most + WHOLE_TOLERANCE)
+        remedy = f"set at most {most:g}" if most else "set a higher loop.rate_hz: 1 cycle is too long"
+        yield Check("times", "warning", f"{setting}: {longer}", remedy, key)
     if not wrong:
         yield Check("times", "ok", f"{count} times and counts are plausible")
+
+
+def _settling(config: Config) -> Iterator[Check]:
+    """Check that a goal can be in position before the time-out, also after a reversal of sliders with backlash."""
+    settling, period, backlash = config.limits.in_position, config.period, config.correction.backlash
+    take_up = reserve_for_backlash(backlash, config.limits.slider).duration
+    least = take_up + (math.ceil(settling.dwell / period) + POSITION_DELAY_CYCLES) * period
+    if settling.timeout >= least:
+        return
+    setting = f"limits.in_position.timeout = {settling.timeout:g} s"
+    after = f"the dwell and {POSITION_DELAY_CYCLES} cycles of {period:g} s"
+    remedy = f"set at least {rounded_inwards(least, 3, low=True):g}"
+    if take_up == 0.0:
+        finding = f"{setting}: shorter than {after}: goals may end as unsettled"
+    else:
+        finding = f"{setting}: shorter than {take_up:.3g} s, in which a slider crosses correction.backlash, {after}: "
+        finding += "goals that reverse a slider may end as unsettled"
+        remedy += ", or raise velocity, acceleration and jerk in limits.slider"
+    yield Check("times", "warning", finding, remedy, "limits.in_position.timeout")
 
 
 def _sizes(config: Config) -> Iterator[Check]:
@@ -145,6 +176,7 @@ CONFIG_CHECKS = (
         ),
         _times,
     ),
+    ConfigCheck(("limits.in_position", "limits.slider", "correction.backlash", "loop.rate_hz"), _settling),
     ConfigCheck(("telemetry.rotate_mb", "telemetry.keep_mb"), _sizes),
     ConfigCheck(
         ("limits.slider", "drives.A.homing", "drives.B.homing", "drives.C.homing"),

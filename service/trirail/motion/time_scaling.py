@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
+from trirail.config import Limits
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse_into
-from trirail.motion.feasibility import Checker, SampleResult
+from trirail.motion.feasibility import PLATFORM_LAW_SHARES, Checker, SampleResult
 from trirail.motion.paths import Path, constant_law, law_falls
 from trirail.motion.ruckig_call import try_solve
 from trirail.motion.rules import RULES
@@ -45,6 +46,11 @@ class Quickness(NamedTuple):
         return by / change + change / jerk if by * jerk > change**2 else 2.0 * math.sqrt(by / jerk)
 
 
+def quickest_at(velocity: Array, acceleration: Array, jerk: Array) -> Quickness:
+    """Return the quickness with which a motion at these velocities reaches limits of acceleration and jerk, (n,)."""
+    return Quickness(float((acceleration / velocity).min()), float((jerk / velocity).min()))
+
+
 class TimeScaling:
     """Generator of laws for the paths of one robot."""
 
@@ -55,8 +61,7 @@ class TimeScaling:
         self._period = period
         self._ruckig = Ruckig(1)
         self._limits = checker.law_limits.T
-        velocity, acceleration, jerk = self._limits[:, :3]
-        self.full_speed = Quickness(float((acceleration / velocity).min()), float((jerk / velocity).min()))
+        self.full_speed = quickest_at(*self._limits[:, :3])
         """Quickness with which a motion at full speed reaches the platform's limits."""
 
     def start_run(self, path: Path, rate: float, pose: Sequence[float]) -> Run:
@@ -139,7 +144,7 @@ class TimeScaling:
         speed = velocity + acceleration**2 / (2.0 * jerk)
         # A stop takes at least two periods.
         speed = np.maximum(speed, np.minimum(jerk * self._period, greatest) * self._period) / rate
-        return Quickness(float((greatest / speed).min()), float((jerk / speed).min()))
+        return quickest_at(speed, greatest, jerk)
 
 
 def greatest_rate(rate: float, result: SampleResult) -> float:
@@ -152,3 +157,22 @@ def greatest_rate(rate: float, result: SampleResult) -> float:
         if math.isnan(result.leaves_at) and result.slowdown_factor > 0.0
         else 1.0
     )
+
+
+def stop_duration(limits: Limits, reachable: Array) -> float:
+    """Return the longest duration of a stop on a line at constant velocity [s].
+
+    The time along the path slows down, so that all axes stop together: the distance of each axis is its velocity
+    times half of the duration. A stop during an acceleration, in a curve or just before the path brakes can be longer,
+    because the path itself uses a part of the limits. `limits` come from backlash_reserve.planned_limits. `reachable`
+    (3,) are velocities of the platform that it cannot exceed because of the sliders.
+    """
+    platform, slider = limits.platform, limits.slider
+    velocity, acceleration, jerk = (
+        np.array([platform.velocity, platform.acceleration, platform.jerk]).T * PLATFORM_LAW_SHARES
+    ).T
+    full = quickest_at(np.minimum(velocity, reachable), acceleration, jerk)
+    change, change_jerk = quickest_at(*map(np.array, (slider.velocities, slider.accelerations, slider.jerks)))
+    most = min(change / full.change, change_jerk / full.jerk)
+    share = next((share for share in CHANGE_SHARES if share <= most), most)
+    return full.scaled(float(share)).duration(1.0)
