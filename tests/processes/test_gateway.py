@@ -20,6 +20,7 @@ from control_rig import CONFIG, carried
 from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
 from trirail.processes.incoming import GOAL_PATIENCE, GOALS, GOALS_OF_ONE, MAX_COMMAND_WAIT, Incoming
+from trirail.processes.monitoring import Meter, ServiceMeasurements
 from trirail.processes.replies import REFUSALS_OF_USER
 from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER, REPLY_TIMEOUT_S
 from trirail.processes.session_guard import Guard
@@ -681,3 +682,21 @@ def test_a_stop_is_forwarded_while_the_loop_keeps_sending(tmp_path: Path) -> Non
         gateway._handle_packet = handle  # type: ignore[assignment,method-assign]
         gateway.serve(lambda: None)
     assert not link._said
+
+
+def test_monitoring_has_the_warnings_and_faults_of_the_state(rig: Rig) -> None:
+    """Whoever watches /healthz alone learns why goals are refused, as `trirail status` shows it."""
+    measured: list[ServiceMeasurements] = []
+    rig.gateway._meter = Meter(measured.append)  # type: ignore[arg-type]
+    conflict = rig.gateway._name_conflict
+    conflict._tokens.add(("", "another service"))
+    conflict._grace_ends = 0.0
+    conflict.poll()
+    lost = "nothing is recorded: the disk is full"
+    rig.hear(packets.Status(None, 1.0, "drive B: EMCY", unrecorded=lost, unready=("C is absent",)))
+    rig.record(1)
+    state = rig.gateway._states.newest(rig.gateway.warnings())
+    (newest,) = measured
+    assert (newest.warnings, newest.faults) == (state.warnings, state.faults)
+    assert ["same name" in newest.warnings[0], *newest.warnings[1:]] == [True, lost]
+    assert newest.faults == ("drive B: EMCY", "C is absent")

@@ -65,6 +65,7 @@ class Told:
 
     def __init__(self) -> None:
         self.now = 0.0
+        self.warnings: tuple[str, ...] = ()
         self.measured: list[ServiceMeasurements] = []
         self.meter = Meter(self.measured.append, lambda: self.now)  # type: ignore[arg-type]
         self._states = StateMaker(
@@ -81,7 +82,7 @@ class Told:
 
     def newest(self) -> ServiceMeasurements:
         self.now += 1.0
-        self.meter.publish(self._states.newest, ResourceUse(3, 512, 40, 1024), ())
+        self.meter.publish(lambda: self._states.newest(self.warnings), ResourceUse(3, 512, 40, 1024))
         return self.measured[-1]
 
 
@@ -284,8 +285,24 @@ def test_health_is_red_until_all_are_up_and_says_which(local: tuple[str, Health]
             "ok": False,
             "processes": dict.fromkeys((*PROCESSES, "supervisor"), "ok") | {"planner": "not running"},
             "warnings": [],
+            "faults": [],
         },
     )
+
+
+def test_health_and_metrics_have_the_same_warnings(local: tuple[str, Health]) -> None:
+    """They are no reason to be red: the processes run, and a restart of the service would not help."""
+    url, looked = local
+    looked.poll(ALL_UP)
+    told = Told()
+    told.warnings = "the robot's name is in use", "nothing is recorded"
+    told.rows()
+    looked.store("gateway", msgspec.to_builtins(told.newest()))
+    status, body = get(f"{url}/healthz")
+    assert (status, json.loads(body)["warnings"]) == (200, [*told.warnings])
+    metrics = get(f"{url}/metrics")[1]
+    assert 'trirail_service_problems{kind="warning"} 2.0' in metrics
+    assert 'trirail_service_problems{kind="fault"} 0.0' in metrics
 
 
 def test_metrics_are_those_of_the_collector_and_all_else_is_not_found(local: tuple[str, Health]) -> None:

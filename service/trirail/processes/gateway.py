@@ -332,7 +332,7 @@ class Gateway:
         self._poses.measure(rows[-1])
         if self._meter is not None:
             self._meter.records(rows)
-            self._meter.publish(self._states.newest, self._link_monitor.use, self._link_monitor.warnings())
+            self._meter.publish(lambda: self._states.newest(self.warnings()), self._link_monitor.use)
         now = self._records_at = time.monotonic()
         if now >= self._state_due and self._declared:  # a client may send a request as soon as it has a state
             self._state_due = max(self._state_due + self._state_every, now)

@@ -101,6 +101,9 @@ class ServiceMetrics(Collector):
 def _loop(service: ServiceMeasurements) -> Iterator[Metric]:
     modes = {name: float(name == service.mode) for name in MODES}
     yield _gauge("mode", "1 for the mode that the robot is in, 0 for the others.", ["mode"], modes)
+    problems = {"warning": len(service.warnings), "fault": len(service.faults)}
+    words = "Number of warnings and faults in the state; /healthz lists them."
+    yield _gauge("service_problems", words, ["kind"], problems)
     yield _counter("loop_cycles", "SYNCs sent since the start.", value=service.cycles)
     yield _counter("loop_missed_ticks", "Ticks missed since the start.", value=service.overruns)
     yield _histogram("loop_lateness_seconds", "Delay of a cycle after its deadline.", service.lateness)
@@ -254,8 +257,9 @@ class MetricsServer:
                 status = HTTPStatus.OK if fit else HTTPStatus.SERVICE_UNAVAILABLE
                 processes = {name: trouble or "ok" for name, trouble in troubles.items()}
                 service = self._health.service
-                warnings = service.warnings if service is not None else ()
-                return _respond(start, status, {"ok": fit, "processes": processes, "warnings": warnings})
+                warnings, faults = ((), ()) if service is None else (service.warnings, service.faults)
+                content = {"ok": fit, "processes": processes, "warnings": warnings, "faults": faults}
+                return _respond(start, status, content)
         return _respond(start, HTTPStatus.NOT_FOUND, {"error": "unknown path: use /metrics or /healthz"})
 
 

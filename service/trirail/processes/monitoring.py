@@ -100,7 +100,8 @@ class ServiceMeasurements(Struct, frozen=True):
     use: ResourceUse
     """Use of resources that are limited, such as file descriptors."""
     warnings: tuple[str, ...]
-    """Warnings about resources that are nearly used up."""
+    """This field and the next one are the same as in trirail.wire.state.State."""
+    faults: tuple[str, ...]
     outputs: dict[str, bool] = {}
     """Value of each configured output, by name."""
     inputs: dict[str, bool] = {}
@@ -132,8 +133,11 @@ class Meter:
         self._lateness.add(rows["lateness_ns"] * 1e-9)
         self._cycle.add(rows["parts_ns"].sum(axis=1) * 1e-9)
 
-    def publish(self, newest: Callable[[], State], use: ResourceUse, warnings: tuple[str, ...]) -> None:
-        """Send all measurements if MEASUREMENT_PERIOD_S has passed since they were last sent."""
+    def publish(self, newest: Callable[[], State], use: ResourceUse) -> None:
+        """Send all measurements if MEASUREMENT_PERIOD_S has passed since they were last sent.
+
+        `newest` returns the newest state, with its warnings.
+        """
         now = self._clock()
         if now < self._due:
             return
@@ -151,7 +155,8 @@ class Meter:
                 lateness=self._lateness,
                 cycle=self._cycle,
                 use=use,
-                warnings=warnings,
+                warnings=state.warnings,
+                faults=state.faults,
                 outputs=state.outputs,
                 inputs=state.inputs,
             )
