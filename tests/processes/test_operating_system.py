@@ -114,3 +114,9 @@ def test_the_unit_is_hardened() -> None:
         check=False,
     )
     assert judged.returncode == 0, judged.stdout[-200:]
+
+
+def test_the_unit_names_each_key_whose_address_it_may_block() -> None:
+    comment = UNIT.read_text().split("IPAddressDeny=")[0].rpartition("\nPrivateDevices=")[2]
+    for key in ("zenoh.listen", "zenoh.connect", "telemetry.metrics_address", "can.options"):
+        assert key in comment
