@@ -16,7 +16,6 @@ from trirail.motion.backlash_reserve import planned_limits
 from trirail.motion.time_scaling import stop_duration
 from trirail.quantities import rounded_inwards
 
-
 REACHABLE_FACTOR = 2.0
 """Factor by which the platform may be faster near the edge of its workspace than in the middle."""
 MOST_CONDITION = 1e9
@@ -83,7 +82,8 @@ def _reachable(config: Config) -> Array:
     j1, j2 = jacobians(corrected_geometry(config), (0.0, 0.0, 0.0))
     if np.linalg.cond(j2) > MOST_CONDITION:
         return np.full(3, np.inf)
-    return REACHABLE_FACTOR * np.abs(np.linalg.solve(j2, j1)) @ config.limits.slider.velocities
+    reachable: Array = REACHABLE_FACTOR * np.abs(np.linalg.solve(j2, j1)) @ config.limits.slider.velocities
+    return reachable
 
 
 def _rail(config: Config) -> Iterator[Check]:
