@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from motion.test_motion import only_from_rest
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker
-from trirail.motion.goal_planner import Extension, GoalPlanner
+from trirail.motion.goal_planner import MIN_REPLAN_RATE, Extension, GoalPlanner
 from trirail.motion.limits import Bounds
 from trirail.motion.path_planner import PathPlanner
 from trirail.motion.runs import rest
@@ -37,14 +37,19 @@ def rig() -> ControlRig:
 
 @pytest.mark.parametrize(("override", "stops"), [(0.05, False), (0.01, False), (0.0, True)])
 def test_only_from_a_path_that_has_nearly_stopped_the_robot_stops_first(override: float, stops: bool) -> None:
-    rig = ControlRig(SLOW if stops else CONFIG)  # a slow robot takes many cycles to the standstill
+    platform = CONFIG.limits.platform
+    jerk = tuple(limit / 200.0 for limit in platform.jerk)  # so that the last of a stop takes many cycles
+    slow = msgspec.structs.replace(
+        CONFIG, limits=msgspec.structs.replace(CONFIG.limits, platform=msgspec.structs.replace(platform, jerk=jerk))
+    )
+    rig = ControlRig(slow if stops else CONFIG)
     rig.enable()
     rig.command("override", override or 0.05)
     accepted(rig, "g1", PoseGoal(0.1, 0.0, 0.0))
     rig.cycles(1000)
     if stops:
         rig.command("override", override)
-        rig.until(lambda: 0.0 < rig.control.schedule.runs[0].law_state.rate < 0.005)
+        rig.until(lambda: 0.0 < rig.control.schedule.runs[0].law_state.rate < MIN_REPLAN_RATE)
     assert accepted(rig, "g2", PoseGoal(0.0, 0.02, 0.0)).reply.stops_first is stops
     rig.command("override", 1.0)
     rig.until(rig.holds, 20_000)

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 import pytest
-from control.test_control import assert_within_limits
+from control.test_control import ROBOT, assert_within_limits
 from control_rig import CONFIG, ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,8 +19,10 @@ from trirail.motion.feasibility import PLATFORM_PLAN_SHARES
 from trirail.motion.paths import Path
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.rate_change import RateChange
+from trirail.motion.rules import RULES
 from trirail.motion.runs import MotionState, Run, rest, stretched
 from trirail.motion.schedule import Schedule
+from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted
 
@@ -174,3 +176,26 @@ def test_a_move_can_be_stopped_at_any_time_whatever_the_velocity_limits_are(
     rig.order("stop")
     assert rig.until(rig.holds) * PERIOD <= 0.4
     assert_within_limits(rig)
+
+
+@settings(max_examples=30)
+@given(st.integers(1, 700), st.sampled_from([1.0, 5.0]), st.floats(0.1, 1.0), st.sampled_from(["stop", "pause"]))
+def test_a_stop_never_begins_noticeably_later_for_the_sake_of_a_quicker_one(
+    begun_for: int, factor: float, speed: float, command: str
+) -> None:
+    """By the rules of before, only changes were tried that suit full speed."""
+
+    def braking_since(rules: int) -> tuple[int, int]:
+        rig = ControlRig(of_velocities(factor))
+        if rules == 1:
+            rig.control._planner._scaling = TimeScaling(ROBOT, rig.control._planner._scaling._checker, PERIOD, rules)
+        rig.enable()
+        assert isinstance(rig.send("move", PoseGoal(0.05, 0.02, 0.2, speed=speed)), Accepted)
+        rig.cycles(begun_for)
+        rig.order(command)
+        begun = rig.until(lambda: rig.control.commanded.at_rest or rig.control.schedule.runs[-1].law_state.change < 0.0)
+        return begun, begun + rig.until(lambda: rig.control.commanded.at_rest)
+
+    (before, stood_before), (begun, stood) = map(braking_since, (1, RULES))
+    assert begun <= before + 2
+    assert stood <= stood_before + 3

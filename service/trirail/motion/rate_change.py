@@ -209,8 +209,8 @@ class RateChange:
         if quick is None:
             if self._searched and self.lowers_rate:
                 self._excess = next(self._excesses, math.inf)
-            motion = self._schedule.commanded
-            self._tries = self._scaling.tries(run.law_state, self._possible, motion, CHANGE_SHARES)
+            motion, urgent = self._schedule.commanded, not self.applied
+            self._tries = self._scaling.tries(run.law_state, self._possible, motion, CHANGE_SHARES, urgent=urgent)
             self._searched, quick = True, next(self._tries)
         return quick
 
