@@ -4,6 +4,7 @@ to do: nothing moves behind a stop, every set ends, and no error or task is left
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from typing import Any, cast
 
@@ -14,6 +15,7 @@ from trirail.bluesky.flight import Flight
 from trirail.bluesky.mover import AxisMove, Mover, cancel, setpoint_of
 from trirail.client import goal as goal_module
 from trirail.client.async_client import AsyncRobot
+from trirail.client.call_time import called_at
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.state import Pose
@@ -48,6 +50,8 @@ class Robot:
         self.accepts.set()
         self.refuses: Exception | None = None
         self.cancelled = 0
+        self.called: list[float] = []
+        """When the program called for each goal."""
         self.told: asyncio.Queue[State | Exception] = asyncio.Queue()
 
     async def state(self) -> State:
@@ -64,6 +68,7 @@ class Robot:
 
     async def move_to(self, x: float, y: float, phi: float, **_: Any) -> AsyncGoalHandle:
         self.targets.append((x, y, phi))
+        self.called.append(called_at())
         try:
             await self.accepts.wait()
         except asyncio.CancelledError:
@@ -136,6 +141,25 @@ def test_sets_that_wait_are_stopped_before_their_goal_is_sent(success: bool, end
         assert [await outcome(move) for move in moves] == ends
         await until(lambda: not mover._tasks)
         assert robot.targets == []
+
+    run(work)
+
+
+def test_a_goal_is_called_for_when_its_first_set_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that a stop which the program calls between the set and the sending of its goal refuses the goal."""
+    monkeypatch.setattr(mover_module, "GATHERING_S", 0.05)
+
+    async def work(robot: Robot, mover: Mover) -> None:
+        before = time.monotonic()
+        first = mover.start({0: 0.01})
+        between = time.monotonic()
+        await asyncio.sleep(0.001)
+        second, third = mover.start({1: 0.01}), mover.start({1: 0.02})
+        after = time.monotonic()
+        await until(lambda: len(robot.goals) == 2)
+        robot.end("done")
+        assert [await outcome(move) for move in (first, second, third)] == ["", "preempted", ""]
+        assert before <= robot.called[0] <= between < robot.called[1] <= after
 
     run(work)
 
@@ -388,7 +412,9 @@ def test_a_flight_that_is_stopped_while_its_path_is_sent_does_not_fly() -> None:
         flight = Stage(robot, mover).flight()
         robot.accepts.clear()
         begun = flight.kickoff()
+        after = time.monotonic()
         await until(lambda: len(robot.targets) == 1)
+        assert robot.called[0] <= after
         stopping = asyncio.create_task(flight.stop(success=False))
         await until(lambda: flight._stopped is not None)
         robot.accepts.set()

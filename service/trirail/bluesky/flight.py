@@ -14,6 +14,7 @@ from ophyd_async.core import AsyncStatus, Device
 
 from trirail.bluesky.mover import Sending, cancel, check_done
 from trirail.client.async_client import AsyncRobot
+from trirail.client.call_time import called
 from trirail.client.goal import AsyncGoalHandle
 from trirail.errors import TrirailError
 from trirail.wire.marks import Switch, switch_rows
@@ -102,7 +103,8 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         self._goal, self._samples, self._collected, self._stopped, self._paused = None, [], 0, None, False
         self._interrupted = None
         self._loop, self._sending = asyncio.get_running_loop(), Sending()
-        self._begun = status = AsyncStatus(self._kickoff())
+        with called():  # a stop that is called later refuses the goals
+            self._begun = status = AsyncStatus(self._kickoff())
         self._stage.note_flight(self)
         if (plan := asyncio.current_task()) is not None:
             plan.add_done_callback(lambda _: self._end_with_plan(status))

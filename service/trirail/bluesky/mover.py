@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from trirail.client.async_client import AsyncRobot
+from trirail.client.call_time import called, called_at
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.state import Pose, State
@@ -147,6 +148,8 @@ class Mover:
         self._loop = asyncio.get_running_loop()
         self._gathered: list[AxisMove] = []
         """Sets that later sets may still join. A new list begins with the next goal."""
+        self._gathered_from = 0.0
+        """Time at which the program called the first of these sets; a stop that was called later refuses their goal."""
         self._unsent: list[AxisMove] = []
         """Sets for which no goal has been sent yet. A stop ends these sets without sending a goal."""
         self._motion: _Motion | None = None
@@ -162,6 +165,8 @@ class Mover:
         move.end.add_done_callback(lambda end: end.cancelled() or end.exception())
         if any(move.shares_axis(other) for other in self._gathered):
             self._start_task()  # send a goal for the earlier sets first
+        if not self._gathered:
+            self._gathered_from = called_at()
         self._gathered.append(move)
         self._unsent.append(move)
         if len(self._gathered) == 1:
@@ -247,7 +252,8 @@ class Mover:
             await asyncio.gather(ended, lost, return_exceptions=True)  # both tasks must end before this call does
 
     def _start_task(self, delay: float = 0.0) -> None:
-        task = asyncio.create_task(self._send_later(self._gathered, delay))
+        with called(self._gathered_from):
+            task = asyncio.create_task(self._send_later(self._gathered, delay))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         if not delay:
