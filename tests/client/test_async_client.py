@@ -158,7 +158,6 @@ def test_a_hundred_calls_at_once_take_no_thread(silent: Silent, locator: str) ->
 
 CALLS: dict[str, Callable[[AsyncRobot], Awaitable[object]]] = {
     "cmd/ann/enable": lambda robot: robot.enable(),
-    "cmd/ann/home": lambda robot: robot.home(),
     "info": lambda robot: robot.info(),
     "poses": lambda robot: robot.poses(),
     "teach/ann/pick": lambda robot: robot.teach("pick"),
@@ -188,6 +187,21 @@ def test_a_goal_whose_sending_is_cancelled_is_stopped_if_it_was_taken(silent: Si
 
     run(locator, work)
     assert keys == ["goal/ann", 'trirail/demo/cmd/ann/stop {"goal":"g"}']
+
+
+def test_homing_whose_waiting_is_cancelled_is_stopped(silent: Silent, locator: str) -> None:
+    """The sliders would go on to their switches, for minutes, without a program that knows of it."""
+    keys: list[str] = []
+
+    async def work(robot: AsyncRobot) -> None:
+        keys.append(await cancel_when_asked(robot.home(), silent))
+        with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as query:
+            keys.append(str(query.key_expr))
+            assert query.payload is not None
+            assert query.payload.to_string() == '{"goal":null}'
+
+    run(locator, work)
+    assert keys == ["cmd/ann/home", "trirail/demo/cmd/ann/stop"]
 
 
 def test_a_goal_that_is_not_answered_is_stopped_if_it_was_taken(silent: Silent, locator: str) -> None:

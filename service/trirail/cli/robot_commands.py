@@ -443,7 +443,12 @@ def command_line_of(name: Command) -> Callable[..., int]:
 
     def send_command(*values: object, service: Service = HERE) -> int:
         with service.open() as robot:
-            reply = robot.command(name, name.content(*values) if values else None)
+            try:
+                reply = robot.command(name, name.content(*values) if values else None)
+            except KeyboardInterrupt:
+                if name is Command.HOME:
+                    terminal.err.print("homing is stopped")
+                raise
         confirmed(service, name, reply)
         return 0
 

@@ -390,8 +390,8 @@ class AsyncRobot:
         goal = (await self.state()).goal
         return goal is not None and goal.id == goal_id
 
-    def _stop_unanswered(self, goal_id: str) -> None:
-        """Stop a goal whose sender was cancelled or received no reply, without waiting for a reply."""
+    def _stop_unanswered(self, goal_id: str | None = None) -> None:
+        """Stop a goal or homing whose sender was cancelled or received no reply, without waiting for a reply."""
         with contextlib.suppress(ServiceError):  # the connection is closed
             stop = msgspec.json.encode(Stop(goal_id))
             self._connection.query_unanswered(("cmd", self.user, Command.STOP), stop)
@@ -546,7 +546,10 @@ class AsyncRobot:
         await self.command(Command.RESET)
 
     async def home(self) -> None:
-        """Home the drives that have no absolute position; return when all are homed and hold the robot's position."""
+        """Home the drives that have no absolute position; return when all are homed and hold the robot's position.
+
+        If the call is cancelled, homing stops.
+        """
         await self.command(Command.HOME)
 
     async def pause(self) -> None:
@@ -608,7 +611,12 @@ class AsyncRobot:
             return await self._stop(command, payload)
         within = {Command.HOME: HOME_WITHIN, Command.ENABLE: ENABLE_WITHIN}.get(command, REPLY_WITHIN)
         before = began if command.starts else math.inf
-        reply = await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
+        try:
+            reply = await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
+        except (asyncio.CancelledError, ServiceError):
+            if command is Command.HOME:  # else the sliders would go on to their switches
+                self._stop_unanswered()
+            raise
         if command is Command.RESUME:
             self._connection.forget_pause(began)
         return reply
