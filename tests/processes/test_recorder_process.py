@@ -69,7 +69,11 @@ def test_the_last_packets_of_a_loop_that_has_left_a_packet_unread_are_recorded(t
     assert len(read(file).records) == len(records)
 
 
-def test_the_loop_is_told_which_events_are_written(tmp_path: Path) -> None:
+def event(seq: int) -> bytes:
+    return message(EventReport(Event("service", "info", "output switched", seq=seq, t=0.0, cycle=0, time=0.0)))
+
+
+def test_the_loop_is_told_which_events_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ours, loops = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, loops:
         intake = recording.Intake(config_in(tmp_path), None, PacketLink(ours), lambda _: None)
@@ -84,11 +88,15 @@ def test_the_loop_is_told_which_events_are_written(tmp_path: Path) -> None:
 
         assert written() == []
         for seq in (1, 2):
-            intake.on_packet(
-                message(EventReport(Event("service", "info", "output switched", seq=seq, t=0.0, cycle=0, time=0.0)))
-            )
+            intake.on_packet(event(seq))
         assert written() == [2]
         assert written() == []
+        with monkeypatch.context() as full:
+            full.setattr(intake.recorder, "_write", lambda _: False)
+            intake.on_packet(event(3))
+            assert written() == []
+        intake.on_packet(event(4))
+        assert written() == [4]
         intake.close()
 
 

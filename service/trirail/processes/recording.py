@@ -107,7 +107,8 @@ class Intake:
         Also report to the loop when writing begins to fail, and when it works again.
         """
         self.recorder.save()
-        if self._newest_event != self._reported_event and self._send(EventsWritten(self._newest_event)):
+        reports = self._newest_event != self._reported_event and not self.recorder.keeps_events
+        if reports and self._send(EventsWritten(self._newest_event)):
             self._reported_event = self._newest_event
         what, why = self.recorder.unrecorded  # only `what` is compared: `why` contains the free space, which changes
         if what != self._reported_unrecorded and self._send(Unrecorded(what and f"{what}: {why}")):

@@ -184,6 +184,11 @@ class Recorder:
         return "", ""
 
     @property
+    def keeps_events(self) -> bool:
+        """Whether events wait for a file that can be written."""
+        return bool(self._unwritten)
+
+    @property
     def skipped(self) -> int:
         """Number of batches that were dropped because the live view was too slow."""
         return self._live.skipped if self._live else 0
