@@ -180,7 +180,7 @@ def test_a_move_can_be_stopped_at_any_time_whatever_the_velocity_limits_are(
 
 @settings(max_examples=30)
 @given(st.integers(1, 700), st.sampled_from([1.0, 5.0]), st.floats(0.1, 1.0), st.sampled_from(["stop", "pause"]))
-def test_a_stop_never_begins_noticeably_later_for_the_sake_of_a_quicker_one(
+def test_a_stop_never_begins_later_for_the_sake_of_a_quicker_one(
     begun_for: int, factor: float, speed: float, command: str
 ) -> None:
     """By the rules of before, only changes were tried that suit full speed."""
@@ -197,5 +197,5 @@ def test_a_stop_never_begins_noticeably_later_for_the_sake_of_a_quicker_one(
         return begun, begun + rig.until(lambda: rig.control.commanded.at_rest)
 
     (before, stood_before), (begun, stood) = map(braking_since, (1, RULES))
-    assert begun <= before + 2
-    assert stood <= stood_before + 3
+    assert begun == before
+    assert stood <= stood_before + 2

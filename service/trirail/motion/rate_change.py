@@ -209,8 +209,11 @@ class RateChange:
         if quick is None:
             if self._searched and self.lowers_rate:
                 self._excess = next(self._excesses, math.inf)
-            motion, urgent = self._schedule.commanded, not self.applied
-            self._tries = self._scaling.tries(run.law_state, self._possible, motion, CHANGE_SHARES, urgent=urgent)
+            if self.applied:
+                motion = self._schedule.commanded
+                self._tries = self._scaling.tries(run.law_state, self._possible, motion, CHANGE_SHARES)
+            else:  # any change that begins now is better than a quicker one that is found later
+                self._tries = map(self._scaling.full_speed.scaled, CHANGE_SHARES)
             self._searched, quick = True, next(self._tries)
         return quick
 

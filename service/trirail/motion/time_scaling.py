@@ -89,18 +89,15 @@ class TimeScaling:
                 return law
         return None
 
-    def tries(
-        self, at: LawState, rate: float, motion: MotionState, shares: Sequence[float], *, urgent: bool = False
-    ) -> Iterator[Quickness]:
+    def tries(self, at: LawState, rate: float, motion: MotionState, shares: Sequence[float]) -> Iterator[Quickness]:
         """Yield the quickness of each change of rate to try in turn: first as quick as the present speed allows.
 
-        `shares` are fractions of the quickest change at full speed, which are yielded last. With `urgent`, only one
-        change for the present speed comes before them, because any change that begins soon is better than a late one.
+        `shares` are fractions of the quickest change at full speed, which are yielded last.
         """
         full, by = self.full_speed, at.rate - rate
         present = self._present_speed(at.rate, motion) if by > 0.0 else None
         if present is not None:
-            first = map(present.scaled, self._first_shares[:1] if urgent else self._first_shares)
+            first = map(present.scaled, self._first_shares)
             yield from takewhile(lambda quick: quick.duration(by) < full.duration(by), first)
         yield from map(full.scaled, shares)
 
