@@ -617,6 +617,14 @@ def slower(config: Config, **limits: float) -> Config:
     return msgspec.structs.replace(config, limits=msgspec.structs.replace(config.limits, slider=slider))
 
 
+def with_sliders_of(shares: tuple[float, float, float]) -> Config:
+    """The shipped robot with these shares of its sliders' velocity, acceleration and jerk."""
+    limits, (v, a, j) = CONFIG.limits.slider, shares
+    return slower(
+        CONFIG, velocity=v * limits.velocities[0], acceleration=a * limits.accelerations[0], jerk=j * limits.jerks[0]
+    )
+
+
 SLOW = slower(CONFIG, velocity=0.2, acceleration=1.5, jerk=30.0)
 """Sliders for which most of the platform's motions are too fast."""
 

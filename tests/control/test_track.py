@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from control.test_control import assert_within_limits
+from control.test_control import assert_within_limits, with_sliders_of
 from control.test_stop import PROMPT, braking, confirmed_after
-from control_rig import CONFIG, ControlRig
-from hypothesis import given, settings
+from control_rig import CONFIG, ControlRig, expected_duration
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from refusals import refusal
-from trirail.wire.goals import TrackGoal, VelocityGoal
+from trirail.wire.goals import PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, GoalRequest, Refused
 from trirail.wire.vocabulary import Mode
 
@@ -178,6 +178,35 @@ def test_a_target_out_of_a_sliders_travel_is_waited_for_too(rig: ControlRig) -> 
     assert pose[0] == pytest.approx(pose[1], abs=1e-3)  # straight on from where it stood
     assert np.linalg.norm(pose[:2]) > 0.02
     assert np.abs([rig.control.commanded.velocity, rig.control.commanded.acceleration]).max() < 1e-9
+    assert_within_limits(rig)
+
+
+SHARE = st.sampled_from([0.05, 0.1, 0.2, 0.5, 0.7, 1.0])
+
+
+@example((0.1, 0.1, 0.1), (0.0, 0.0235, 0.0), (50.0, 0.25))
+@example((0.05, 0.05, 0.05), (0.04, 0.05, -0.3), (10.0, 0.25))
+@example((1.0, 0.05, 1.0), (0.04, -0.02, 0.2), (200.0, 0.05))
+@given(
+    st.tuples(SHARE, SHARE, SHARE),
+    st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-0.4, 0.4)),
+    st.sampled_from([(10.0, 0.25), (10.0, 1.0), (50.0, 0.06), (50.0, 0.25), (200.0, 0.05)]),
+)
+@settings(max_examples=30)
+def test_a_still_target_is_reached_where_the_sliders_are_slower_than_the_platform(
+    shares: Vector, target: Vector, renewals: tuple[float, float]
+) -> None:
+    config = with_sliders_of(shares)
+    rate, timeout = renewals
+    asked = ControlRig(config)
+    asked.enable()
+    needed = expected_duration(asked.send("g1", PoseGoal(*target)))
+    assume(needed > 0.02)
+    rig = ControlRig(config)
+    rig.enable()
+    lags = track(rig, lambda _: (target, STILL), regular(rate, 3.0 * needed + 0.3), timeout=timeout)
+    assert lags[-1] == pytest.approx(STILL, abs=1e-6)
+    assert [answer for answer in rig.answers if isinstance(answer, Refused)] == []
     assert_within_limits(rig)
 
 

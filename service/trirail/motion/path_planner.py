@@ -302,12 +302,14 @@ class PathPlanner:
             )
         return Plan(path, slowed(slower))
 
-    def path_to_velocity(self, start: MotionState, velocity: Sequence[float]) -> Path:
-        """Return the quickest path to a velocity within the platform's limits. Limits of the sliders are not checked.
+    def path_to_velocity(
+        self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic | None = None
+    ) -> Path:
+        """Return the quickest path to a velocity within limits of the platform, by default the platform's own limits.
 
-        Raises RefusedError if no path is possible.
+        Limits of the sliders are not checked. Raises RefusedError if no path is possible.
         """
-        return self._solver.to_velocity(start, velocity, self.platform)
+        return self._solver.to_velocity(start, velocity, limits or self.platform)
 
     def distance(self, pose: Sequence[float], target: Sequence[float]) -> float:
         """Return an upper bound of the distance that any point of the platform travels between two poses [m]."""

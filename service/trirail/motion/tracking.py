@@ -32,8 +32,11 @@ noise in the reports."""
 SMOOTH_DURATION_FACTOR = 1.25
 """Shortest duration of a smooth motion to the target, relative to the quickest motion. From rest to rest, the smooth
 motion then stays within the same acceleration and jerk limits with a margin of one fifth."""
-MAX_REPLANS = 3
+MAX_REPLANS = 10
 """Greatest number of plans to meet a target. Each plan has lower limits than the previous plan."""
+MAX_SEPARATE_REPLANS = 3
+"""Number of replans that lower the limits of velocity, acceleration and jerk separately, as far as each is exceeded.
+Later replans slow the motion as a whole, which always leads to a path that fits if the robot starts at rest."""
 MAX_SHORTENINGS = 2
 """Greatest number of times that a path is shortened because it leaves the workspace."""
 BORDER_BISECTIONS = 12
@@ -130,7 +133,7 @@ class Tracker:
     def _plan_meeting(self, start: MotionState, target: _TrackTarget, hold: float) -> Plan | None:
         """Plan a motion that meets the target, if necessary with lower limits. Returns None if no path fits."""
         shares = np.ones(3)
-        for _ in range(MAX_REPLANS):
+        for replan in range(MAX_REPLANS):
             limits = Kinodynamic(*(np.array(self._platform) * shares[:, None]).tolist())
             bounds = [
                 LIMIT_UTILISATION * most / abs(v) for v, most in zip(target.velocity, limits.velocity, strict=True) if v
@@ -139,31 +142,37 @@ class Tracker:
             velocity = [share * v for v in target.velocity]
             try:
                 quickest = self._quickest_meeting(start, target.pose, velocity, limits)
+                smooth = _smooth_meeting(
+                    start, target.pose, velocity, max(CATCH_UP_S, SMOOTH_DURATION_FACTOR * quickest.duration)
+                )
+                too_fast = None
+                for meeting in (smooth, quickest):
+                    path, result, bound = self._follow_and_brake(start, meeting, velocity, hold, limits)
+                    if result.fits or (result.within_limits and not start.at_rest):
+                        return Plan(path, bound=bound or target.bound)
+                    if math.isnan(result.leaves_at):
+                        too_fast = result
             except RefusedError:
                 return None
-            smooth = _smooth_meeting(
-                start, target.pose, velocity, max(CATCH_UP_S, SMOOTH_DURATION_FACTOR * quickest.duration)
-            )
-            for meeting in (smooth, quickest):
-                path, result, bound = self._follow_and_brake(start, meeting, velocity, hold)
-                if result.fits or (result.within_limits and not start.at_rest):
-                    return Plan(path, bound=bound or target.bound)
-            if not math.isnan(result.leaves_at):
+            if too_fast is None:
                 return None
-            shares = shares * np.clip(LIMIT_UTILISATION / result.worst.max(axis=0), MIN_LIMIT_SHARE, 1.0)
+            if replan < MAX_SEPARATE_REPLANS:
+                shares = shares * np.clip(LIMIT_UTILISATION / too_fast.worst.max(axis=0), MIN_LIMIT_SHARE, 1.0)
+            else:
+                shares = shares * (LIMIT_UTILISATION / too_fast.slowdown_factor) ** np.arange(1.0, 4.0)
         return None
 
     def _follow_and_brake(
-        self, start: MotionState, meeting: Path, velocity: Sequence[float], hold: float
+        self, start: MotionState, meeting: Path, velocity: Sequence[float], hold: float, limits: Kinodynamic
     ) -> tuple[Path, SampleResult, str | None]:
-        """Extend a path that meets the target: move with the target until `hold` [s], and then brake.
+        """Extend a path that meets the target: move with the target until `hold` [s], and then brake within `limits`.
 
         If the path would leave the workspace after it has met the target, it brakes earlier. Returns the path, the
         result of sampling it, and the name of the limit that makes the path brake earlier, or None.
         """
         way, until, bound = _extend_meeting(meeting, velocity, hold), hold, None
         for _ in range(MAX_SHORTENINGS + 1):
-            brake = self._planner.path_to_velocity(nominal_motion(way, until), ZERO_RATES)
+            brake = self._planner.path_to_velocity(nominal_motion(way, until), ZERO_RATES, limits)
             path = joined([cut(way, until), brake])
             result = self._checker.sample(path, constant_law(1.0), 0.0, path.duration, start.pose)
             if math.isnan(result.leaves_at) or result.leaves_at <= max(meeting.duration, brake.duration):
