@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from conftest import Rig, changed
-from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits
+from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits, with_sliders_of
 from control_rig import CONFIG, ControlRig, expected_duration
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from refusals import refusal
@@ -410,6 +410,34 @@ def test_a_jog_into_a_limit_ends_there_and_says_so(
     assert again.code == "at_limit"
     assert f"has ended at the limit of {bound}" in again.message
     assert rig.outcomes() == [("j1", "done")]
+
+
+@example((0.2, 0.0, 0.0), (0.05, 1.0, 1.0), None)
+@example((0.2, 0.0, 0.0), (0.05, 1.0, 1.0), 0.05)
+@example((0.2, 0.04, -1.4), (1.0, 1.0, 1.0), None)
+@given(
+    st.tuples(st.floats(-0.25, 0.25), st.floats(-0.25, 0.25), st.floats(-1.5, 1.5)),
+    st.tuples(*[st.sampled_from([0.05, 0.2, 0.5, 1.0])] * 3),
+    st.sampled_from([None, None, None, 0.05]),
+)
+@settings(max_examples=50)
+def test_a_jog_that_the_sliders_slow_goes_on_to_the_limit(
+    velocity: tuple[float, float, float], shares: tuple[float, float, float], renewed: float | None
+) -> None:
+    assume(max(abs(velocity[0]), abs(velocity[1]), 0.2 * abs(velocity[2])) > 0.05)
+    rig = ControlRig(with_sliders_of(shares))
+    rig.enable()
+    jog = VelocityGoal(*velocity, timeout=10.0 if renewed is None else 0.25)
+    assert isinstance(rig.send("j1", jog), Accepted)
+    while not rig.holds():
+        rig.cycles(round((renewed or 0.05) / rig.config.period))
+        if renewed is not None:
+            rig.post("j1", jog)
+    assert rig.outcomes() == [("j1", "done")]
+    way = np.array(rig.control.commanded.pose)
+    ahead = way + 0.05 * way + 1e-6 * way / np.abs(way).max()
+    assert refusal(rig.goal("ahead", *ahead.tolist())).code in ("out_of_workspace", "singular")
+    assert_within_limits(rig)
 
 
 TAKEN = (0.3, 1.0, 1.0 + 1e-9, -1.0)

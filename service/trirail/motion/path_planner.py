@@ -233,7 +233,8 @@ class PathPlanner:
         RefusedError
             The robot would not move, or even braking would leave the workspace.
         """
-        slower, softer, hold, bound = 1.0, 1.0, MAX_PATH_RATE * timeout, None
+        longest = MAX_PATH_RATE * timeout
+        slower, softer, hold, bound = 1.0, 1.0, longest, None
         highest = zip(velocity, self.platform.velocity, strict=True)
         share = min([1.0, *(limit / abs(value) for value, limit in highest if value)])
         for _ in range(MAX_JOG_PLANS):
@@ -250,7 +251,11 @@ class PathPlanner:
                 if self._can_hold(path, ramp, brake, start.pose):
                     softer *= result.slowdown_factor / LIMIT_UTILISATION
                 else:
-                    slower *= result.slowdown_factor / LIMIT_UTILISATION
+                    factor = result.slowdown_factor / LIMIT_UTILISATION
+                    slower *= factor
+                    hold *= factor  # the way stays the same
+                    if hold >= longest:
+                        hold, bound = longest, None
                 continue
             bound = self.checker.bound(path, result.leaves_at, start.pose)
             if not any(velocity):
@@ -265,7 +270,7 @@ class PathPlanner:
                 # The ramps alone are too long. From rest, their length falls at least with velocity^(3/2).
                 least = planned - (constant - self._period) * speed
                 share *= min(MAX_JOG_SHARE, (possible / least) ** (2.0 / 3.0)) if start.at_rest else 0.5
-                hold = MAX_PATH_RATE * timeout
+                hold = longest
         if start.at_rest and any(velocity):
             raise _jog_refusal(bound, result)
         path = self._solver.to_velocity(tool_motion(start, tool), ZERO_RATES, self.platform, tool)
