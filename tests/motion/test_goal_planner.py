@@ -8,9 +8,9 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
+from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, with_sliders_of
 from control_rig import CONFIG, ControlRig, expected_duration
-from hypothesis import example, given
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from motion.test_motion import only_from_rest
 from trirail.kinematics.geometry import Geometry
@@ -22,6 +22,8 @@ from trirail.motion.runs import rest
 from trirail.motion.schedule import Schedule
 from trirail.wire.goals import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted
+
+Pose = tuple[float, float, float]
 
 
 def accepted(rig: ControlRig, name: str, goal: PoseGoal) -> Accepted:
@@ -162,6 +164,31 @@ def test_a_jog_towards_a_limit_ends_at_the_limit_however_near_it_is(
     x, y, phi = (sign * share * platform.velocity[kind] * axis).tolist()
     plan = goals.plan(VelocityGoal(x, y, phi, timeout=2.0), Schedule(rest(begin.tolist()), PERIOD), 1.0, 3)
     assert plan.run.path.end == pytest.approx(axis * limit, abs=5e-9)
+
+
+@example((0.1, 0.0, 0.0), (0.05, 0.05, -0.3), 200, (0.3, 0.3, 0.3))
+@given(
+    st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.3, 0.3)),
+    st.tuples(st.floats(-0.06, 0.06), st.floats(-0.06, 0.06), st.floats(-0.5, 0.5)),
+    st.integers(50, 300),
+    st.tuples(*[st.sampled_from([0.3, 0.5, 1.0])] * 3),
+)
+@settings(max_examples=50)
+def test_a_goal_that_preempts_says_how_much_longer_the_sliders_make_it_last(
+    velocity: Pose, target: Pose, cycles: int, shares: Pose
+) -> None:
+    answers, begun = [], []
+    for each in (shares, (10.0, 10.0, 10.0)):
+        rig = ControlRig(with_sliders_of(each))
+        rig.enable()
+        rig.send("j1", VelocityGoal(*velocity, timeout=5.0))
+        rig.cycles(cycles)
+        begun.append(np.concatenate(rig.control.commanded))
+        answers.append(accepted(rig, "g1", PoseGoal(*target)))
+    held, free = answers
+    assume(np.abs(begun[0] - begun[1]).max() < 1e-9 and not held.reply.stops_first and not free.reply.stops_first)
+    assert free.reply.slowed == 1.0
+    assert held.reply.slowed == pytest.approx(expected_duration(held) / expected_duration(free), rel=1e-6)
 
 
 # What plans make use of, of the platform's limits along x.

@@ -344,13 +344,14 @@ class PathPlanner:
             if slower > 1.0:
                 path, slower = self._slow_down(path, slower, start.pose)
             return Plan(path, slowed(slower * speed))
-        shares = np.full(3, speed)
+        shares, asked = np.full(3, speed), 0.0
         for _ in range(MAX_REPLANS):
             lower = Kinodynamic(*(np.array(limits) * shares[:, None]).tolist())
             path = self._solver.to_rest(begin, target, lower, in_sliders, tool)
+            asked = asked or path.duration
             worst = self.checker.worst_shares(path, start.pose)
             if self.checker.keeps_limits(worst):
-                return Plan(path, slowed(speed / float(shares.min())))
+                return Plan(path, slowed(max(1.0, path.duration / asked)))
             shares = shares * np.clip(LIMIT_UTILISATION / worst.max(axis=0), MIN_LIMIT_SHARE, 1.0)
         raise TOO_FAST_IN_MOTION
 
