@@ -89,6 +89,48 @@ def test_one_that_is_too_fast_is_accepted_in_the_time_that_its_refusal_names(
     assert isinstance(rig.send("g2", within(float(named[1]))), Accepted)
 
 
+@example(1e-3, 2e-4, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1e-9)
+@example(1e-3, 2e-4, (0.0, 0.0, 0.0), (0.25, 0.0, 0.0), 1e-9)
+@given(
+    st.sampled_from([1e-3, 0.01, 0.1]),
+    st.floats(1e-4, 5e-3),
+    st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    st.sampled_from([1e-3, 1e-6, 1e-9]),
+)
+@settings(max_examples=200)
+def test_the_time_that_a_refusal_names_is_accepted_also_if_it_is_shorter_than_a_cycle(
+    period: float,
+    duration: float,
+    way: tuple[float, float, float],
+    acceleration: tuple[float, float, float],
+    scale: float,
+) -> None:
+    limits = CONFIG.limits
+    planner = PathPlanner(
+        ROBOT,
+        limits.platform,
+        limits.slider,
+        Bounds(limits, period),
+        Checker(ROBOT, limits, Bounds(limits, period), period),
+        period,
+    )
+    end = scale * np.array(way)
+    begins = 20.0 * period * np.array(acceleration) * limits.platform.jerk
+
+    def within(seconds: float) -> list[Point]:
+        begin = (begins * (duration / seconds) ** 2).tolist()
+        still = (0.0, 0.0, 0.0)
+        return [Point(0.0, still, still, begin), Point(seconds, end.tolist(), still, still)]
+
+    try:
+        planner.plan_trajectory(rest((0.0, 0.0, 0.0)), within(duration), stretch=False)
+    except RefusedError as error:
+        named = re.search(r"let it last ([0-9.]+) s", str(error))
+        assert named
+        planner.plan_trajectory(rest((0.0, 0.0, 0.0)), within(float(named[1])), stretch=False)
+
+
 SPEED = st.floats(-0.5, 0.5)
 SCALE = st.sampled_from((1.0, 1e-3, 1e-6, 1e-9))
 

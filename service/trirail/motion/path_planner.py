@@ -300,7 +300,7 @@ class PathPlanner:
             raise RefusedError(
                 RefusalCode.TOO_FAST,
                 f"the trajectory is {slower:.3g} times too fast for {most_exceeded(worst)}: "
-                f"let it last {math.ceil(1e3 * path.duration) / 1e3:.10g} s, "
+                f"let it last {self._fitting_milliseconds(path, start.pose) / 1e3:.10g} s, "
                 'or send it with "stretch": true (trirail follow --stretch)',
                 value=slower,
                 limit=1.0,
@@ -401,6 +401,21 @@ class PathPlanner:
         raise RefusedError(
             RefusalCode.TOO_FAST, f"the path exceeds its limits even when it is slowed {factor:.3g} times"
         )
+
+    def _fitting_milliseconds(self, path: Path, pose: Sequence[float]) -> int:
+        """Return the duration of a path that fits, rounded up to whole milliseconds at which it also fits [ms].
+
+        If a path lasts less than a cycle, the jerk over a cycle may rise when the path lasts longer. Raises
+        RefusedError as _slow_down does.
+        """
+        duration = math.ceil(1e3 * path.duration)
+        while True:
+            rounded = stretched(path, 1e-3 * duration / path.duration)
+            factor = slowdown_factor(self.checker.worst_shares(rounded, pose))
+            if factor <= 1.0:
+                return duration
+            path, _ = self._slow_down(rounded, factor, pose)
+            duration = max(duration + 1, math.ceil(1e3 * path.duration))
 
     def _can_hold(self, path: Path, ramp: float, brake: float, pose: Sequence[float]) -> bool:
         """Return whether a jog is within the limits during its part at constant velocity."""
