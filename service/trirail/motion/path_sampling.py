@@ -37,6 +37,9 @@ PEAK_BISECTIONS = 6
 """Number of bisection steps after which the error of a peak of the velocity is below a thousandth."""
 MIN_SAMPLES_IN_PIECE, MAX_SAMPLES_IN_PIECE = 4, 16
 """Least and greatest number of samples in every piece of a path."""
+SHORT_STEP_S = 0.001
+"""Cycle time above which the least number of samples in a piece is higher [s]. Peaks between samples are estimated from
+the jerk over a cycle, which says little if the cycle lasts longer than the interval of the samples."""
 PIECE_SAMPLE_INTERVAL_S = 0.03
 """Interval of the samples in a piece, if their number allows this interval [s]."""
 MAX_VELOCITY_RISE = 0.25
@@ -54,9 +57,10 @@ def _insert_time(times: Array, n: int, time: float, first: float, until: float) 
 
 
 @compiled()
-def _samples_in_piece(duration: float) -> int:
-    """Return the number of samples in a piece of a path with a duration [s]."""
-    return int(min(max(duration / PIECE_SAMPLE_INTERVAL_S, MIN_SAMPLES_IN_PIECE), MAX_SAMPLES_IN_PIECE))
+def _samples_in_piece(duration: float, step: float) -> int:
+    """Return the number of samples in a piece of a path with a duration [s], for a cycle time `step` [s]."""
+    least = MIN_SAMPLES_IN_PIECE * max(1.0, step / SHORT_STEP_S)
+    return int(min(max(duration / PIECE_SAMPLE_INTERVAL_S, least), MAX_SAMPLES_IN_PIECE))
 
 
 @compiled(allocates=True)
@@ -84,7 +88,7 @@ def _sample_times(
     for k in range(low, high + 1):
         time = passing_time(law_knots, law_pieces, knots[k], until)
         if k > low:
-            number = _samples_in_piece(knots[k] - knots[k - 1])
+            number = _samples_in_piece(knots[k] - knots[k - 1], step)
             for part in range(1, number):
                 n = _insert_time(times, n, last + (time - last) * part / number, first, until)
         if begin <= knots[k] <= end:
