@@ -571,6 +571,15 @@ def test_an_answer_by_sdo_does_not_replace_inputs_that_a_pdo_has_brought_since_i
     assert axis.inputs == 0
 
 
+def test_inputs_whose_request_the_drive_refuses_are_not_requested_in_every_cycle(closing: Closing) -> None:
+    rig = closing(with_inputs(LATE_INPUTS["inhibit time"]))
+    rig.ready()
+    axis, now = rig.drives._axes[0], rig.clock.now
+    axis.note_request(now, canopen_frames.INPUTS_UPLOAD)
+    axis.on_sdo(b"\x80\xfd\x60\x00" + bytes(4), now)
+    assert axis.inputs_due == now + canopen_frames.POLL_PERIOD
+
+
 # ---------------------------------------------------------------------- drives that miss outputs
 
 

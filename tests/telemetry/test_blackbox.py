@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.telemetry.blackbox import AFTER_S, BEFORE_S, BlackBox
@@ -130,3 +131,20 @@ def test_faults_that_a_slow_disk_loses_are_reported_once() -> None:
     assert [box.reason for box in run.boxes] == ["fault 700", "fault 2550"]
     codes = [text.fields["event_code"] for text in run.told]
     assert codes == [EventCode.BLACK_BOX_LATER, EventCode.NO_BLACK_BOX]
+
+
+@pytest.mark.parametrize("age", [3.0, 30.0, 100.0])
+def test_a_fault_of_before_the_recorder_gets_no_file_but_the_reason(age: float) -> None:
+    """The loop sends events again to a recorder that has restarted."""
+    run = Run(set(), 0, write_all)
+    t = 1000 / RATE_HZ
+    run._box.event(Event("fault", "error", "old", seq=1, t=t - age, cycle=1, time=1e9 + t - age))
+    for first in range(1000, 2600, BATCH):
+        batch = np.zeros(BATCH, DTYPE)
+        batch["cycle"] = range(first, first + BATCH)
+        run._box.records(batch.tobytes())
+        write_all()
+    run._box.close()
+    assert run.boxes == []
+    (told,) = run.told
+    assert "the recorder has restarted since" in told.text

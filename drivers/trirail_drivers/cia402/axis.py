@@ -157,6 +157,7 @@ class Cia402Axis(Axis):
             self._statusword_asked, self._overtaken = True, False
         elif request == canopen_frames.INPUTS_UPLOAD:
             self._inputs_overtaken = False
+            self.inputs_due = now + canopen_frames.POLL_PERIOD  # also if the drive refuses the request
         if self.unanswered:  # the drive may lose the earlier request
             self.word_by_sdo, self.outputs_sent = None, NOTHING_SENT
         # Until an answer is counted as lost, no statusword is requested; a few lost answers must not become a fault.
@@ -298,7 +299,6 @@ class Cia402Axis(Axis):
         elif canopen_frames.is_upload(data, canopen_frames.INPUTS_UPLOADED):
             if not self._inputs_overtaken:
                 self.on_inputs(data[4:8], now)
-            self.inputs_due = now + canopen_frames.POLL_PERIOD
         elif data[:4] == canopen_frames.OUTPUTS_REFUSED:
             code = int.from_bytes(data[4:8], "little")
             self.note_fault("state", 0, f"refuses its digital outputs, object 60FE:01 (SDO abort {code:08X})")

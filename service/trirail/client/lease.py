@@ -17,6 +17,8 @@ from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 
 SIGNS = 4
 """Number of renewals per time-out; the lease continues if at least one of them arrives."""
+RELEASED_WITHIN_S = 1.0
+"""Time for which a task that was cancelled waits for the release of its lease [s], if its time-out is not earlier."""
 _PASSING = RefusalCode.BUSY, RefusalCode.TIMEOUT
 """Refusals of a renewal that do not end the lease."""
 
@@ -52,7 +54,7 @@ class AsyncLease:
             reply = await self._command(Command.ACQUIRE, msgspec.json.encode(asked))
         except asyncio.CancelledError:  # the service may have granted the lease
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(self._sign.timeout):  # afterwards, the lease has ended in any case
+                async with asyncio.timeout(min(self._sign.timeout, RELEASED_WITHIN_S)):
                     await self._release()
             raise
         self._keeping = asyncio.create_task(self._keep(), name="lease")

@@ -97,6 +97,8 @@ class BlackBox:
     def records(self, batch: bytes) -> None:
         """Store packed records. Write a file if it is due, unless the last one is still being written."""
         self._t = last_cycle(batch) / self._rate_hz
+        if not self._records:
+            self._drop_earlier_faults()
         self._records.append(StoredInput(next(self._order), self._t, methodcaller("records", batch)))
         oldest = self._t - KEPT_S
         while self._records[0].t < oldest:
@@ -156,6 +158,13 @@ class BlackBox:
             self._reported.add(EventCode.BLACK_BOX_LATER)
             words = f"black box: faults repeat within a minute; those until t = {due:.1f} s are saved in one file"
             self._warn(coded(words, EventCode.BLACK_BOX_LATER, until=due))
+
+    def _drop_earlier_faults(self) -> None:
+        """Drop the faults of the time before the first records, which the loop has sent again to this recorder."""
+        dropped = len(self._faults)
+        self._faults = deque(fault for fault in self._faults if fault.t > self._t - MARGIN_S)
+        if len(self._faults) < dropped:
+            self._warn_unsaved("the recorder has restarted since")
 
     def _report_loss(self, oldest: float) -> None:
         """Drop the faults before `oldest`, whose data is no longer in the memory; report that once per file."""
