@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -150,6 +152,28 @@ def test_a_wait_ends_if_the_service_is_silent_and_not_if_it_refuses(error: Excep
         assert len(checks) > 1
         goal.end(Result("g1", "done", ""))
         assert (await goal.wait()).outcome == "done"
+
+    asyncio.run(wait())
+
+
+def test_time_in_which_the_program_was_suspended_does_not_count_as_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(goal_module, "CHECK_PERIOD_S", 0.01)
+    suspended, checks = [0.0], list[None]()
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + suspended[0])
+    monkeypatch.setattr(goal_module, "time", clock)
+
+    async def check() -> None:
+        checks.append(None)
+        if len(checks) == 1:
+            suspended[0] = 1000.0
+            raise ServiceError("no robot answers")
+
+    async def wait() -> None:
+        goal = AsyncGoalHandle("g1", no_command, check, no_command)
+        with pytest.raises(WaitTimeoutError):
+            await goal.wait(0.2)
+        assert len(checks) > 1
+        goal.end(Result("g1", "done", ""))
 
     asyncio.run(wait())
 

@@ -27,6 +27,8 @@ BRAKE_RENEWAL_S = 0.05
 """Time-out of the last renewal of a jog, which sets the velocity to zero [s]."""
 CHECK_PERIOD_S = 2.0
 """Period at which a wait for the end of a goal checks that the service answers [s]."""
+MAX_CHECK_PERIODS = 2.0
+"""Longest time between two such checks, in periods; a longer time means that the process was suspended."""
 SILENT_AFTER_S = 15.0
 """Time without an answer after which such a wait ends [s]; a lost connection is often restored within this time."""
 
@@ -146,9 +148,10 @@ class AsyncGoalHandle:
     async def _wait_until_unknown(self) -> str:
         """Return the reason why the end of the goal is unknown, once it is.
 
-        Either the service has not answered for SILENT_AFTER_S, or the end may be among events that were missed.
+        Either the service has not answered for SILENT_AFTER_S, or the end may be among events that were missed. Time in
+        which this process was suspended does not count.
         """
-        answered = time.monotonic()
+        silent, since = 0.0, time.monotonic()
         while True:
             await asyncio.sleep(CHECK_PERIOD_S)
             try:
@@ -156,12 +159,14 @@ class AsyncGoalHandle:
                 if self._missed and await self._is_present():
                     self._missed = ""  # the goal has not ended yet
             except ServiceError as error:
-                if time.monotonic() - answered > SILENT_AFTER_S:
+                now = time.monotonic()
+                silent, since = silent + min(now - since, MAX_CHECK_PERIODS * CHECK_PERIOD_S), now
+                if silent > SILENT_AFTER_S:
                     return str(error)
                 continue
             except RefusedError:
                 pass  # a refusal is an answer, too
-            answered = time.monotonic()
+            silent, since = 0.0, time.monotonic()
             if self._missed:
                 return (
                     f"the client has missed {self._missed}, and the goal is not in progress; if it is queued, wait "
