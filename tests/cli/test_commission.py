@@ -216,7 +216,7 @@ def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path
     with pytest.raises(FaultSyntaxError, match="did you mean reversed"):
         run(robot, "--yes", "--fault", "A reverse", "--report", "a.json")
     real = tmp_path / "real.toml"
-    real.write_text(SIM.read_text(encoding="utf-8").replace('interface = "simulated"', 'interface = "vcan"'))
+    real.write_text(SIM.read_text(encoding="utf-8").replace('interface = "simulated"', 'interface = "socketcan"'))
     for option in (["--yes"], ["--fault", "A loose"]):
         with pytest.raises(ConfigError, match=f"{option[0]} is only for simulated drives"):
             run(str(real), *option)

@@ -547,7 +547,7 @@ def _renewing(robot: Robot) -> bool:
 
 def test_ctrl_c_ends_a_command_and_the_next_one_is_answered(robot: Robot, slow: Slow) -> None:
     kept: list[zenoh.Query] = []
-    interrupt(robot.home, lambda: kept.append(slow.next()))
+    interrupt(robot.enable, lambda: kept.append(slow.next()))
     kept.clear()
     enabling = Call(lambda: robot.command("enable").mode)
     reply(slow.next(), CommandReply("enable", "holding", 1))

@@ -493,7 +493,7 @@ class TestFaults:
         feedback = enabled.move(50)
         assert feedback.fault is not None
         assert feedback.fault[:2] == ("A", "fault")
-        assert "following error 5." in feedback.fault.message
+        assert "following error 5" in feedback.fault.message
         assert abs(enabled.target[0] - START[0]) == pytest.approx(0.005, abs=2.5 * SPEED[0] * PERIOD)
 
     def test_restart_is_the_first_reason_whichever_message_tells_of_it(self, ready: Rig) -> None:

@@ -44,6 +44,7 @@ from trirail.control.feedback import Snapshot
 from trirail.control.local_planner import LocalPlanner
 from trirail.errors import ServiceError
 from trirail.motion.motion_planner import MotionPlanner, revision
+from trirail.motion.rules import RULES
 from trirail.telemetry import provenance
 from trirail.telemetry.recording import Recording
 from trirail.wire.packets import ControlInput, DecidedAhead, DrivesFault, PlannerLost
@@ -112,7 +113,7 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
     else:
         planner, inputs = LocalPlanner(config), requests
     software = provenance.recorded_by(recording.texts)
-    control = Control(config, drives, planner, software.rules if software is not None else 1)
+    control = Control(config, drives, planner, software.rules if software is not None else RULES)
     try:
         setpoints, modes, outputs = _run(control, drives, planner, clock, records, inputs)
     finally:
