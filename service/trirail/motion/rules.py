@@ -3,4 +3,4 @@
 from typing import Final
 
 RULES: Final = 2
-"""1: only fractions of the quickest change at full speed. 2: changes that suit the present speed are tried first."""
+"""1: only fractions of the quickest change at full speed. 2: also fractions of the quickest at the present speed."""

@@ -22,8 +22,8 @@ from trirail.motion.runs import LawState, MotionState, Run, arrival_time, law_fr
 
 FINE_RATIO, COARSE_RATIO = 0.88, 0.6
 FIRST_SHARES = (*(FINE_RATIO**k for k in range(4)), *(FINE_RATIO**3 * COARSE_RATIO**k for k in range(1, 16)))
-"""Fractions of the quickest change at the present speed, which are tried first, as long as they are quicker than a
-change at full speed."""
+"""Fractions of the quickest change at the present speed, as far as they are quicker than a change at full speed. They
+are tried before CHANGE_SHARES, except by RateChange until a change has begun, so that it does not begin later."""
 CHANGE_SHARES = (*(FINE_RATIO**k for k in range(12)), *(FINE_RATIO**11 * COARSE_RATIO**k for k in range(1, 9)))
 """Fractions of the quickest change of rate at full speed, which are tried in turn. A smaller fraction gives a longer
 stop. The steps between the fractions are fine for quick stops. They are coarse for long stops, which only robots with
