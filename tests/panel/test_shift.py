@@ -227,12 +227,30 @@ def test_a_file_is_slowed_and_followed_by_keys_alone(page: Page, robot: FakeRobo
 def test_keys_in_a_list_choose_and_move_nothing_but_stop_is_stop(page: Page, robot: FakeRobot, list_: str) -> None:
     page.evaluate(f"document.querySelector('#{list_}').focus()")
     before = page.evaluate(f"document.querySelector('#{list_}').selectedIndex")
-    page.type_key("ArrowDown" if before == 0 else "ArrowUp")
+    page.type_key("Enter")
+    page.until(f"document.querySelector('#{list_}').matches(':open')")
+    for key in ("a", "d", "ArrowLeft", "ArrowRight", "ArrowDown" if before == 0 else "ArrowUp"):
+        page.type_key(key)
+    page.type_key("Enter")
     page.until(f"document.querySelector('#{list_}').selectedIndex !== {before}")
     assert not robot.sent
     page.type_key("Space")
     wait(lambda: "stop" in robot.commands, "a stop")
     page.evaluate("localStorage.clear()")
+
+
+def test_keys_move_nothing_where_an_open_list_is_filled_again(page: Page, robot: FakeRobot) -> None:
+    page.evaluate("document.querySelector('#tool').focus()")
+    page.type_key("Enter")
+    page.until("document.querySelector('#tool').matches(':open')")
+    page.type_key("ArrowDown")
+    page.evaluate("document.querySelector('#tool option').dataset.before = 'yes'")
+    for colours in ("dark", "light"):
+        page.colours(colours)
+    page.until("!document.querySelector('#tool option').dataset.before")
+    page.type_key("ArrowDown")
+    page.type_key("ArrowUp")
+    assert not robot.sent
 
 
 @pytest.mark.parametrize(

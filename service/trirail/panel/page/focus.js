@@ -11,7 +11,8 @@ export const owner = () => lost;
 // Set the `property` "disabled" or "hidden" of an element.
 export function withhold(element, property, value) {
   if (element[property] === value) return;
-  if (value && element.contains(document.activeElement)) lost = document.activeElement;
+  const focused = document.activeElement;
+  if (value && element.contains(focused)) lost = focused.closest("select") ?? focused; // it may be on an option
   element[property] = value;
   if (!value && element.contains(lost)) lost.focus({ preventScroll: true });
 }

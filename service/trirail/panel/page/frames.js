@@ -33,6 +33,8 @@ export function inBase([x, y, phi], [fx, fy, angle]) {
 // Offer names in a <select>, and keep what is chosen where it is still there; hidden where there is nothing to choose.
 export function offer(select, entries) {
   const chosen = select.value;
+  const focused = select.contains(document.activeElement); // it may be on an option, which is replaced
   select.replaceChildren(...entries.map(([value, name]) => new Option(name, value, false, value === chosen)));
+  if (focused) select.focus({ preventScroll: true });
   withhold(select.closest("label"), "hidden", entries.length < 2);
 }

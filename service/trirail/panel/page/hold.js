@@ -8,7 +8,7 @@ import { owner } from "./focus.js";
 export const EVERY = 50; // between two signs of the hand [ms]; the service brakes 200 ms after the last
 export const HUNG = 180; // a sign so late comes from a page that has hung: what it held counts no more [ms]
 
-const OWN_KEYS = "input, select, #events, #sessions"; // what does something else with these keys
+const OWN_KEYS = "input, select, #events, #sessions"; // they, and what is in them, have other uses for these keys
 const KEYS = {
   ArrowRight: ["x", 1], ArrowLeft: ["x", -1], ArrowUp: ["y", 1], ArrowDown: ["y", -1], a: ["phi", 1], d: ["phi", -1],
 };
@@ -30,7 +30,7 @@ export class Hold {
     addEventListener("keyup", (event) => this.#up(`key ${event.code}`));
     for (const gone of ["blur", "pagehide", "freeze", "dragstart"]) addEventListener(gone, () => this.end());
     // While a list or a menu is open, the browser gives it every key, also the end of one that was held before.
-    addEventListener("pointerdown", (event) => event.target.matches("select") && this.end(), true);
+    addEventListener("pointerdown", (event) => event.target.closest("select") && this.end(), true);
     addEventListener("contextmenu", (event) => event.defaultPrevented || this.end());
     document.addEventListener("visibilitychange", () => document.hidden && this.end());
   }
@@ -63,14 +63,14 @@ export class Hold {
 
   #key(event) {
     // The key's end may be told to nobody; a key in a list may open it.
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("select")) return this.end();
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select")) return this.end();
     const onButton = event.key === "Enter" && this.buttons.includes(event.target);
     const axis = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    if (!onButton && (!axis || event.target.matches(OWN_KEYS))) return;
+    if (!onButton && (!axis || event.target.closest(OWN_KEYS))) return;
     event.preventDefault();
     if (event.repeat) return;
     const lost = owner();
-    if (lost?.matches(OWN_KEYS)) return this.barred(lost);
+    if (lost?.closest(OWN_KEYS)) return this.barred(lost);
     const [name, sign] = axis ?? [];
     const matching = (each) => each.dataset.axis === name && Number(each.dataset.sign) === sign;
     this.#down(`key ${event.code}`, onButton ? event.target : this.buttons.find(matching));
