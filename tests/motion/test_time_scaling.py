@@ -112,7 +112,7 @@ def test_a_path_runs_at_the_rate_at_which_it_meets_a_limit_and_no_faster(slower:
 def test_the_first_stop_that_fits_is_taken_and_ends_at_rest(over: float) -> None:
     run = run_of(stretched(way((0.1, 0.0, 0.0)), PLATFORM_PLAN_SHARES[2] ** (-1 / 3)))  # it takes what plans may
     run.time = over * run.path.duration
-    law = SCALING.stop(run, run.state(0.0, HERE), (1.0, 0.5, 0.25))
+    law = SCALING.stop(run, HERE, (1.0, 0.5, 0.25))
     assert law is not None
     assert at(law, 1e3)[1:, 0] == pytest.approx((0.0, 0.0), abs=1e-9)
     run.change_law(law, 0.0)
@@ -176,7 +176,28 @@ def test_falling_is_told_as_dense_looks_tell_it(pieces: list[tuple[float, int]],
     assert law_falls(law.knots, law.pieces) == (by > 1e-12)
 
 
-def test_a_law_of_a_higher_power_is_none() -> None:
-    law = constant_law(1.0)
-    law.pieces[0, 0, 4] = 1e-3
-    assert law_falls(law.knots, law.pieces)
+@given(
+    st.lists(st.tuples(st.floats(0.01, 0.5), *3 * [st.floats(-100.0, 100.0)]), min_size=1, max_size=4),
+    st.floats(0.0, 2.0),
+    st.floats(-8.0, 8.0),
+)
+def test_no_law_of_degree_5_falls_unnoticed(
+    pieces: list[tuple[float, float, float, float]], rate: float, change: float
+) -> None:
+    knots, rows, s = [0.0], [], 0.0
+    for span, *rest in pieces:
+        piece = np.polynomial.Polynomial([s, rate, change / 2.0, *rest])
+        rows.append(piece.coef)
+        s, rate, change = (float(each(span)) for each in (piece, piece.deriv(), piece.deriv(2)))
+        knots.append(knots[-1] + span)
+    law = Path(np.array(knots), np.array(rows, dtype=np.float64)[:, None, :])
+    dense = np.array([at(law, time)[0, 0] for time in np.linspace(0.0, knots[-1], 2001)])
+    assert law_falls(law.knots, law.pieces) or (np.maximum.accumulate(dense) - dense).max() < 1e-11
+    assert not law_falls(*constant_law(0.0)[:2])
+
+
+@pytest.mark.parametrize(("power", "factor"), [(4, 1.0), (5, 1.0), (4, -1.0), (5, -1.0)])
+def test_a_law_of_degree_5_that_rises_is_one(power: int, factor: float) -> None:
+    law = Path(np.array([0.0, 0.1]), np.zeros((1, 1, 6)))
+    law.pieces[0, 0, 1], law.pieces[0, 0, power] = 1.0, factor * 2.0 * 0.1 ** (1 - power) / power
+    assert law_falls(law.knots, law.pieces) == (factor < 0.0)

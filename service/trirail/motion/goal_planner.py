@@ -199,7 +199,7 @@ class GoalPlanner:
         """Plan a motion that first stops on the old path, and then begins at rest."""
         stop, law = schedule.runs[0].copy(), None
         if stop.target != 0.0:
-            law = self.time_scaling.stop(stop, schedule.commanded, STOP_SHARES)
+            law = self.time_scaling.stop(stop, schedule.commanded.pose, STOP_SHARES)
             if law is not None:  # otherwise, the current motion runs to the end of its path
                 stop.change_law(law, 0.0)
         left = stop.end_time - stop.time

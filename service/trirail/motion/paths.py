@@ -268,18 +268,29 @@ def earliest_time(s: float) -> float:
     return s - MAX_TIME_FALL_S - RELATIVE_TIME_FALL * abs(s)
 
 
+@compiled()
+def _least_bernstein_coefficient_of_rate(p: Array, span: float) -> float:
+    """Return the least Bernstein coefficient of the first derivative of a polynomial of degree 5 from 0 to `span`."""
+    a, b, c, d, e = p[1], 2.0 * p[2] * span, 3.0 * p[3] * span**2, 4.0 * p[4] * span**3, 5.0 * p[5] * span**4
+    third = a + b / 2.0 + c / 6.0
+    least: float = min(a, a + b / 4.0, third, third + b / 4.0 + c / 3.0 + d / 4.0, a + b + c + d + e)
+    return least
+
+
 @compiled("b1(f8[::1], f8[:, :, ::1])")
 def law_falls(law_knots: Array, law_pieces: Array) -> bool:
     """Return True if a law is invalid because the time along the path decreases by more than rounding.
 
-    The pieces of a law are cubic. The extrema of the time along the path are therefore at knots, and at the zeros of
-    the rate, which is a parabola. If a piece has a higher degree, the result is also True.
+    In a cubic piece, the extrema of the time along the path are at knots, and at the zeros of the rate, which is a
+    parabola. In a piece of a higher degree, the rate is at least its least Bernstein coefficient.
     """
     highest = -math.inf
     for k in range(len(law_pieces)):
         p, span = law_pieces[k, 0], law_knots[k + 1] - law_knots[k]
         if p[4] != 0.0 or p[5] != 0.0:
-            return True
+            if span * _least_bernstein_coefficient_of_rate(p, span) < -MAX_TIME_FALL_S:
+                return True
+            continue
         a, b, c = 3.0 * p[3], p[2], p[1]  # the rate is a t^2 + 2 b t + c, which is zero where t = (-b -+ root) / a
         root = math.sqrt(max(0.0, b * b - a * c))
         q = -(b + math.copysign(root, b))

@@ -17,7 +17,7 @@ from trirail.motion.feasibility import SUBJECTS, SampleResult, parts
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run, arrival_time
 from trirail.motion.schedule import Schedule
-from trirail.motion.time_scaling import CHANGE_SHARES, Quickness, TimeScaling, greatest_rate
+from trirail.motion.time_scaling import CHANGE_SHARES, Change, TimeScaling, greatest_rate
 
 MIN_SAMPLES_PER_CYCLE = 40
 """Least number of samples in and next to pieces of a path that are taken in one cycle."""
@@ -78,9 +78,9 @@ class RateChange:
         self._scaling = scaling
         self._schedule = schedule
         self._period = period
-        self._tries: Iterator[Quickness] = iter(())
-        self._quick: Quickness | None = None
-        """Quickness of the change that is tried now; None if the next one is due."""
+        self._tries: Iterator[Change] = iter(())
+        self._try: Change | None = None
+        """Change that is tried now; None if the next one is due."""
         self._samples = max(MIN_SAMPLES_PER_CYCLE, int(SAMPLES_PER_SECOND * period))
         self._restart()
 
@@ -164,7 +164,7 @@ class RateChange:
             self._candidate = self._propose(run)
         candidate = self._candidate
         if candidate is None:
-            self._quick = None
+            self._try = None
             return
         if candidate.ahead:
             path, first, until, own = candidate.ahead.pop()
@@ -172,7 +172,7 @@ class RateChange:
             allowed = own * self._excess if own is not None else None
             result = self._scaling.sample(path, candidate.law, first, until, pose, allowed)
             if not result.within_limits:
-                self._candidate = self._quick = None
+                self._candidate = self._try = None
                 return
         if not candidate.ahead and candidate.begins == cycle:
             self._change_law(run, candidate.law)
@@ -201,21 +201,21 @@ class RateChange:
 
     def _begin_search(self) -> None:
         """Try the quickest change next."""
-        self._tries, self._quick = iter(()), None
+        self._tries, self._try = iter(()), None
 
-    def _next_try(self, run: Run) -> Quickness:
-        """Return the quickness of the change to try next. After the last, begin again with the quickest."""
-        quick = next(self._tries, None)
-        if quick is None:
+    def _next_try(self, run: Run) -> Change:
+        """Return the change to try next. After the last, begin again with the quickest."""
+        change = next(self._tries, None)
+        if change is None:
             if self._searched and self.lowers_rate:
                 self._excess = next(self._excesses, math.inf)
             if self.applied:
-                motion = self._schedule.commanded
-                self._tries = self._scaling.tries(run.law_state, self._possible, motion, CHANGE_SHARES)
-            else:  # any change that begins now is better than a quicker one that is found later
-                self._tries = map(self._scaling.full_speed.scaled, CHANGE_SHARES)
-            self._searched, quick = True, next(self._tries)
-        return quick
+                pose = self._schedule.commanded.pose
+                self._tries = self._scaling.tries(run, self._possible, pose, CHANGE_SHARES)
+            else:
+                self._tries = self._scaling.first_tries(self._possible)
+            self._searched, change = True, next(self._tries)
+        return change
 
     def _is_prompt(self, law: Path) -> bool:
         """Return whether a change to a lower rate takes at most PROMPTNESS times as long as a stop within own limits.
@@ -236,10 +236,10 @@ class RateChange:
         The law begins late enough for all of its parts to be sampled before.
         """
         cycles = 1
-        quick = self._quick = self._quick or self._next_try(run)
+        change = self._try = self._try or self._next_try(run)
+        pose = self._schedule.commanded.pose
         for _ in range(MAX_POSTPONEMENTS):
-            at = run.law_state if cycles == 1 else run.law_state_at(run.time + (cycles - 1) * self._period)
-            law = self._scaling.ramp(at, self._possible, quick)
+            law = self._scaling.law(run, run.time + (cycles - 1) * self._period, self._possible, change, pose)
             if law is None or (self.applied and not self._ends_sooner(run, law, cycles)):
                 return None
             if not self._is_prompt(law):

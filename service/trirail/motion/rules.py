@@ -2,5 +2,6 @@
 
 from typing import Final
 
-RULES: Final = 2
-"""1: only fractions of the quickest change at full speed. 2: also fractions of the quickest at the present speed."""
+RULES: Final = 3
+"""1: only fractions of the quickest change at full speed. 2: also fractions of the quickest at the present speed.
+3: stops are first tried as those of a straight motion; see trirail.motion.straight_stop."""
