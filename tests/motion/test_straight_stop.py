@@ -10,7 +10,7 @@ from motion.test_time_scaling import SCALING
 from trirail.kinematics.arrays import Array
 from trirail.motion.paths import Path, law_falls
 from trirail.motion.runs import LawState, joined
-from trirail.motion.straight_stop import Progress
+from trirail.motion.straight_stop import PathProgress
 from trirail.motion.time_scaling import Quickness
 
 FAR = (0.1, 0.0, 0.0)
@@ -43,7 +43,7 @@ def test_the_progress_follows_the_ramp_and_the_law_ends_at_rest(
 ) -> None:
     path = bent(curve)
     begin = LawState(share * path.duration, rate, change)
-    progress = Progress(path, begin, WEIGHTS)
+    progress = PathProgress(path, begin, WEIGHTS)
     ramp = SCALING.ramp(LawState(0.0, 1.0, progress.change), 0.0, Quickness(quick, quick**2))
     assume(ramp is not None)
     assert ramp is not None
@@ -63,7 +63,7 @@ def test_the_progress_follows_the_ramp_and_the_law_ends_at_rest(
 def test_a_path_that_has_just_begun_stops_without_a_law_that_falls(share: float, rate: float) -> None:
     path = way(FAR)
     begin = LawState(share * path.duration, rate, 0.0)
-    progress = Progress(path, begin, WEIGHTS)
+    progress = PathProgress(path, begin, WEIGHTS)
     quick = 2.0 * (progress.change + rate / share)
     ramp = SCALING.ramp(LawState(0.0, 1.0, progress.change), 0.0, Quickness(quick, quick**2))
     assert ramp is not None
@@ -79,5 +79,5 @@ def test_where_the_path_ends_or_stands_there_is_no_law() -> None:
     path = way(FAR)
     ramp = SCALING.ramp(LawState(0.0, 1.0, 0.0), 0.0, Quickness(0.1, 0.1))
     assert ramp is not None
-    assert Progress(path, LawState(0.5 * path.duration, 1.0, 0.0), WEIGHTS).law(ramp) is None  # it ends before
-    assert Progress(path, LawState(0.0, 1.0, 0.0), WEIGHTS).law(ramp) is None  # it stands
+    assert PathProgress(path, LawState(0.5 * path.duration, 1.0, 0.0), WEIGHTS).law(ramp) is None  # it ends before
+    assert PathProgress(path, LawState(0.0, 1.0, 0.0), WEIGHTS).law(ramp) is None  # it stands

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from trirail.config import SIM, everything, load
 from trirail.control.control import Control
+from trirail.processes import loop_process
 from trirail.processes.loop_process import STEP_WITHIN, rehearse
 from trirail.wire.vocabulary import Mode
 
@@ -105,11 +106,14 @@ def test_a_configuration_with_any_number_multiplied_is_refused_or_starts(
     assert modes[0] is Mode.DISABLED
 
 
-def test_a_robot_that_takes_minutes_to_stop_starts_and_lacks_what_was_not_rehearsed(modes: list[Mode]) -> None:
+def test_a_robot_that_stops_slowly_starts_and_lacks_what_was_not_rehearsed(
+    modes: list[Mode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop_process, "STEP_WITHIN", 20)
     config = load(SIM)
     platform = msgspec.structs.replace(config.limits.platform, jerk=(0.004, 0.004, 0.024))
     config = msgspec.structs.replace(config, limits=msgspec.structs.replace(config.limits, platform=platform))
-    assert rehearse(config) == (f"rehearsed stops: the robot was still stopping after {STEP_WITHIN} cycles",)
+    assert rehearse(config) == ("rehearsed stops: the robot was still stopping after 20 cycles",)
     assert modes[-1] is Mode.STOPPING
 
 

@@ -26,7 +26,7 @@ STEP_S = 1e-9
 """Newton step after which the next one would be below rounding [s]."""
 
 
-class Progress:
+class PathProgress:
     """Progress of a path from a state of its law.
 
     `weights` (3,) make the coordinates of the path comparable. Their sizes do not matter.

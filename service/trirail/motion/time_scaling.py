@@ -19,7 +19,7 @@ from trirail.motion.paths import Path, constant_law, law_falls, platform_at_law_
 from trirail.motion.ruckig_call import try_solve
 from trirail.motion.rules import RULES
 from trirail.motion.runs import LawState, Run, arrival_time, law_from_ruckig
-from trirail.motion.straight_stop import Progress
+from trirail.motion.straight_stop import PathProgress
 
 FINE_RATIO, COARSE_RATIO = 0.88, 0.6
 FIRST_SHARES = (*(FINE_RATIO**k for k in range(4)), *(FINE_RATIO**3 * COARSE_RATIO**k for k in range(1, 16)))
@@ -141,7 +141,7 @@ class TimeScaling:
             return None
         velocity = np.maximum(speeds[0], NEGLIGIBLE * speeds[0].max())
         _, greatest, jerk = self._limits
-        progress = Progress(run.path, at, 1.0 / jerk[3:] ** 2 if run.path.in_sliders else 1.0 / jerk[:3] ** 2)
+        progress = PathProgress(run.path, at, 1.0 / jerk[3:] ** 2 if run.path.in_sliders else 1.0 / jerk[:3] ** 2)
         quick = quickest_at(velocity, greatest, jerk).scaled(change.share)
         ramp = self.ramp(LawState(0.0, 1.0, progress.change), 0.0, quick)
         if ramp is None or float(ramp.knots[-2]) > run.end_time - time - self._period:  # the motion ends as soon
