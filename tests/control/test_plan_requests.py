@@ -13,7 +13,7 @@ import pytest
 from control.test_control import assert_within_limits
 from control.test_stop import PROMPT, STEP, braking, confirmed_after, play
 from control_rig import CONFIG, ControlRig, expected_duration
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.control.goal_queue import MAX_PASSES
 from trirail.motion.feasibility import SampleResult
@@ -538,6 +538,26 @@ def test_renewals_that_came_before_the_goal_began_are_all_replaced_by_a_newer_on
     assert len([answer for answer in rig.answers if isinstance(answer, Accepted)]) == 4
     rig.cycles(130)
     assert len(meddler.asked) == 3
+
+
+@settings(max_examples=30)
+@given(st.integers(1, 190), st.integers(0, 12), st.integers(1, 90))
+@example(140, 12, 10)
+def test_a_jog_whose_first_plan_takes_long_lasts_from_its_newest_renewal(delay: int, renewals: int, every: int) -> None:
+    rig, timeout = ControlRig(), 200
+    Meddler(rig).delays = [delay, 2]
+    rig.enable()
+    for number in range(renewals + 1):
+        rig.cycles(every - 1 if number else 0)
+        rig.post("j1", VelocityGoal(0.01, 0.0, 0.0, timeout=timeout * PERIOD))
+    speeds = [rig.control.commanded.velocity[0]]
+    for _ in range(timeout - 1):
+        rig.cycle()
+        speeds.append(rig.control.commanded.velocity[0])
+    assert speeds[-1] > 0.0
+    assert min(np.diff(speeds)) > -1e-9  # it does not brake yet
+    rig.cycles(braking(CONFIG) + PROMPT)
+    assert rig.outcomes() == [("j1", "done")]
 
 
 @pytest.mark.parametrize("goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)])

@@ -105,11 +105,8 @@ class GoalQueue:
         sent = _ReceivedGoal(request, cycle - age)
         if self.idle:
             self._served.clear()
-        if self._ledger.renewed_by(request):
-            for before in [other for other in self._waiting if self._ledger.renewed_by(other.request)]:
-                self._waiting.remove(before)
-                self._ledger.pass_over(before.request)
         self._waiting.append(sent)
+        self._pass_over_renewals()
         self._ledger.keep_alive(request, self._alive_until(sent))
 
     def step(self, cycle: int, admit: Callable[[], bool], place: PoseSource) -> GoalRequest | None:
@@ -156,6 +153,7 @@ class GoalQueue:
         expires = sent + valid / self._period if valid is not None else math.inf
         same = [later for later in (self._planned, *self._waiting) if later.request.id == request.id]
         self._ledger.begin(request, accepted, expires, max(map(self._alive_until, same)), at_end=at_end)
+        self._pass_over_renewals()
         return request
 
     def withdraw(self, outcome: Withdrawal, reason: str) -> None:
@@ -206,6 +204,12 @@ class GoalQueue:
     def _not_begun(self) -> list[ActiveGoal]:
         """Planned goals that have not begun to move the robot."""
         return list(self._ledger.goals)[0 if self._schedule.has_not_begun else 1 :]
+
+    def _pass_over_renewals(self) -> None:
+        """Keep only the newest waiting renewal of the current goal. An older one could expire while it is planned."""
+        for before in [sent for sent in self._waiting if self._ledger.renewed_by(sent.request)][:-1]:
+            self._waiting.remove(before)
+            self._ledger.pass_over(before.request)
 
     def _next(self) -> _ReceivedGoal:
         """Remove and return the oldest waiting goal of the user who was served least recently."""
