@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -136,6 +137,39 @@ def test_goals_that_have_not_begun_end_in_the_cycle_of_a_stop() -> None:
         rig.cycles(50)
         assert [answer.code for answer in rig.answers if isinstance(answer, Refused)] == [outcome, outcome]
         assert not any(isinstance(answer, Accepted) for answer in rig.answers)
+
+
+@pytest.mark.parametrize("name", [name for name in Command if name.stops])
+@pytest.mark.parametrize("goals", [1, 3])
+def test_goals_that_come_in_the_cycle_of_a_stop_never_begin(rig: ControlRig, name: Command, goals: int) -> None:
+    """Also before a pause: what has not begun does not wait for resume."""
+    rig.enable()
+    sent = [f"g{number}" for number in range(goals)]
+    for number, each in enumerate(sent):
+        rig.more.append(GoalRequest(900 + number, "ann", each, PoseGoal(0.05, 0.0, 0.0), round(rig.now * 1e9)))
+    rig.order(name)
+    rig.cycles(50)
+    outcome = "faulted" if name is Command.QUICK_STOP else "stopped"
+    assert rig.outcomes() == [(each, outcome) for each in sent]
+    assert not rig.setpoints()[:, 1].any()
+
+
+@pytest.mark.generated(0, 1, 2)
+def test_a_user_who_floods_the_queue_delays_each_goal_of_another_by_one_goal(
+    rig: ControlRig, meddler: Meddler, seed: int
+) -> None:
+    chance = random.Random(seed)
+    out = PoseGoal(5.0, 0.0, 0.0)  # it is refused
+    meddler.delays = [chance.randrange(1, 6)]
+    for number in range(300):
+        rig.cycle(GoalRequest(9000 + number, "eve", f"e{number}", out, round(rig.now * 1e9)))
+    for number in range(10):
+        answered = len(rig.answers)
+        for late in range(chance.randrange(3)):
+            ticket = 10_000 + 10 * number + late
+            rig.more.append(GoalRequest(ticket, "eve", f"e{ticket}", out, round(rig.now * 1e9)))
+        rig.send(f"a{number}", out)
+        assert len(rig.answers) - answered <= 2
 
 
 def test_a_planner_that_is_always_late_is_asked_three_times(rig: ControlRig, meddler: Meddler) -> None:
