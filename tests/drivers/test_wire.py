@@ -12,6 +12,7 @@ import socket
 import struct
 from collections.abc import Iterator
 
+import can
 import carriers
 import pytest
 from carriers import FarEnd
@@ -68,6 +69,10 @@ class Rig:
         self.wire.begin(0.0)
         self.fill() if full else self.drain()
         self.wire.send(Frame(0x080))
+
+
+def full(frame: Frame) -> None:
+    raise can.CanOperationError("Transmit buffer full")
 
 
 @contextlib.contextmanager
@@ -182,6 +187,29 @@ def test_only_data_frames_of_the_identifier_are_heard(rig: Rig) -> None:
     rig.wire.receive(7.0)
     assert rig.listener.heard == [(b"\1\2\3\4", 7.0)]
     assert rig.listener.told == []
+
+
+@pytest.mark.parametrize("stopping", [0, 1, 20])
+def test_a_bus_whose_queue_was_full_carries_what_stops_the_drives_and_is_given_up_after_that(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, stopping: int
+) -> None:
+    """The adapter may be there. python-can's error for a full queue often has no number that would tell."""
+    wire = Wire(
+        rig.bus, BusTiming(1_000_000), rig.stop, Reopening("can0", lambda: AbsentBus("can0"), lambda work: None)
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(wire._frames, "send", full)
+        for _ in range(wires.UNSENT_CYCLES):
+            wire.begin(0.0, stopping=True)
+            assert not wire.send(Frame(0x080))
+    assert wire.down
+    for _ in range(stopping):
+        wire.begin(0.0, stopping=True)
+        assert wire.send(Frame(0x080))
+        assert rig.far.receive()[0] == 0x080
+    wire.begin(0.0)
+    assert not wire.send(Frame(0x080))
+    assert isinstance(wire.bus, AbsentBus)
 
 
 def test_a_listener_that_is_forgotten_hears_no_frame(rig: Rig) -> None:

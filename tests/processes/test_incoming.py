@@ -1,13 +1,18 @@
-"""Users take turns: whoever has much in the queue waits for himself."""
+"""Users take turns: whoever has much in the queue waits for himself, and all that waits has a limit."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+import time
+from collections import Counter, defaultdict, deque
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from trirail.processes.incoming import FairQueue
+from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.incoming import GOAL_PATIENCE, Backlog, FairQueue, Incoming
+from trirail.wire.goals import PoseGoal
+from trirail.wire.packets import GoalRequest
+from trirail.wire.sizes import MAX_UNREAD, MAX_UNREAD_OF_ONE
 
 USERS = "abcd"
 
@@ -53,3 +58,40 @@ def test_a_user_is_served_alone_and_everything_is_changed_in_its_place() -> None
     for nothing in (queue.pop, queue.first):
         with pytest.raises(KeyError):
             nothing("a")
+
+
+def put(backlog: Backlog, user: str, size: int = 100) -> None:
+    now = time.monotonic_ns()
+    incoming = Incoming("goal", f"trirail/demo/goal/{user}", size, b"", "", None, now)
+    backlog.check_room(user, size)
+    backlog.add(incoming, GoalRequest(1, user, "g", PoseGoal(0.0, 0.0, 0.0), now))
+
+
+@given(st.lists(st.tuples(st.sampled_from(USERS), st.integers(0, MAX_UNREAD_OF_ONE)) | st.none(), max_size=60))
+@example([("a", MAX_UNREAD_OF_ONE)] * (MAX_UNREAD // MAX_UNREAD_OF_ONE) + [("b", 1), None, ("b", 1)])
+def test_goals_wait_up_to_a_number_of_bytes_and_each_that_leaves_makes_room(acts: list[tuple[str, int] | None]) -> None:
+    backlog = Backlog()
+    waiting: dict[str, deque[int]] = defaultdict(deque)
+    for act in acts:
+        held = sum(map(sum, waiting.values()))
+        if act is None:
+            for user in backlog.users[:1]:
+                backlog.drop_first(user)
+                waiting[user].popleft()
+        elif held + act[1] <= MAX_UNREAD:
+            put(backlog, *act)
+            waiting[act[0]].append(act[1])
+        else:
+            with pytest.raises(RefusedError) as refused:
+                put(backlog, *act)
+            assert refused.value.code is RefusalCode.BUSY
+
+
+@pytest.mark.parametrize("waits", [0.0, GOAL_PATIENCE + 1.0])
+def test_a_goal_that_was_stopped_says_so_however_long_it_waited(monkeypatch: pytest.MonkeyPatch, waits: float) -> None:
+    backlog = Backlog()
+    put(backlog, "a")
+    backlog.withdraw("g", "stop by b")
+    now = time.monotonic_ns() + round(waits * 1e9)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now)
+    assert backlog.first("a").request.withdrawn == "stop by b"
