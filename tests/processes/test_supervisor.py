@@ -104,6 +104,8 @@ class Running:
         self.told: list[str] = []
         self.events: list[Event] = []
         self.health: Health
+        self.record: Path | None = None
+        """The file in which it is to record."""
 
     def ends(self, code: int, config: Config = CONFIG, /, **children: str) -> None:
         """Run it until it ends with an exit code.
@@ -121,7 +123,7 @@ class Running:
             tell("up")
             (self.folder / "up.begun").touch()
 
-        supervised = supervisor.Supervisor(config, None, lambda words, _: tell(words), self.events.append)
+        supervised = supervisor.Supervisor(config, self.record, lambda words, _: tell(words), self.events.append)
         assert supervised.run(up) == code
         self.health = supervised._health
 
@@ -218,6 +220,22 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
         "up",
         f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; restarting it",
     ]
+
+
+def test_a_recorder_that_is_started_again_has_a_file_of_its_own(run: Running) -> None:
+    """The first one's has what was recorded until then, and is refused as it is not empty."""
+    run.record = run.folder / "named.rrd"
+    dying = "(folder / f'{number}.file').write_text(str(child.order.record)); " + DYING
+    run.ends(
+        1,
+        loop_1="ready(); beat_until(lambda: begun('recorder-3')); heartbeats.heart('loop').rest()",
+        gateway_1=SERVING,
+        recorder_1=dying,
+        recorder_2=dying,
+        recorder_3="ready()",
+    )
+    files = [(run.folder / f"{number}.file").read_text() for number in (1, 2)]
+    assert files == [str(run.record), "None"]
 
 
 def missing() -> str:
