@@ -255,12 +255,11 @@ class Backlog:
 
         Raises KeyError if the user has no goal.
         """
-        incoming, request = self._goals.first(user)
-        if request.withdrawn is None and time.monotonic_ns() - request.received_ns > GOAL_PATIENCE * 1e9:
-            waited = f"the goal waited longer than {GOAL_PATIENCE:g} s"
-            reason = f"{waited} for earlier goals or because the machine was busy: send the goal again"
-            request = structs.replace(request, withdrawn=reason)
-        return WaitingGoal(incoming, request)
+        goal = self._goals.first(user)
+        if time.monotonic_ns() - goal.request.received_ns <= GOAL_PATIENCE * 1e9:
+            return goal
+        waited = f"the goal waited longer than {GOAL_PATIENCE:g} s"
+        return _withdrawn(goal, f"{waited} for earlier goals or because the machine was busy: send the goal again")
 
     def drop_first(self, user: str) -> None:
         """Remove the first goal of a user, because it has been sent to the loop."""
