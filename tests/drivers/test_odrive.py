@@ -487,14 +487,17 @@ class TestFaults:
         assert message.startswith("CAN bus: another master is on the bus and ")
         assert message.endswith(" (drive B); only one master is allowed")
 
-    def test_following_error(self, enabled: Rig) -> None:
-        stuck = enabled.devices[0].servo
+    @pytest.mark.parametrize("index", range(3))
+    def test_following_error(self, enabled: Rig, index: int) -> None:
+        stuck = enabled.devices[index].servo
         stuck.chase = lambda *_: None  # type: ignore[method-assign]
         feedback = enabled.move(50)
         assert feedback.fault is not None
-        assert feedback.fault[:2] == ("A", "fault")
-        assert "following error 5" in feedback.fault.message
-        assert abs(enabled.target[0] - START[0]) == pytest.approx(0.005, abs=2.5 * SPEED[0] * PERIOD)
+        assert feedback.fault[:2] == ("ABC"[index], "fault")
+        off = enabled.target[index] - START[index]
+        assert off * SPEED[index] > 0.0
+        assert f"following error {'-' if off < 0.0 else ''}5" in feedback.fault.message
+        assert abs(off) == pytest.approx(0.005, abs=3.0 * abs(SPEED[index]) * PERIOD)
 
     def test_restart_is_the_first_reason_whichever_message_tells_of_it(self, ready: Rig) -> None:
         ready.cycle()
