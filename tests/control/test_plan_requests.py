@@ -605,6 +605,43 @@ def test_a_goal_that_is_renewed_does_not_wait_as_long_as_the_planning_before_it_
     assert ("g1", "preempted") in rig.outcomes()
 
 
+VALID = st.none() | st.integers(1, 200).map(lambda cycles: cycles * PERIOD)
+SENT = st.tuples(
+    st.sampled_from(["ann", "eve"]),
+    st.builds(PoseGoal, st.just(0.02), st.just(0.0), st.just(0.0), valid_for=VALID, blend=st.sampled_from([None, 0.01]))
+    | st.builds(VelocityGoal, st.just(0.01), st.just(0.0), st.just(0.0), valid_for=VALID, timeout=st.just(0.1)),
+)
+
+
+@settings(max_examples=40)
+@given(st.lists(SENT, min_size=1, max_size=4), st.lists(st.integers(1, 250), min_size=1), st.sampled_from([0.0, 1.0]))
+@example([("ann", PoseGoal(0.02, 0.0, 0.0, valid_for=0.05))], [200], 1.0)
+@example([("ann", VelocityGoal(0.02, 0.0, 0.0, timeout=0.05))], [200], 1.0)
+@example([("ann", PoseGoal(0.02, 0.0, 0.0, valid_for=0.05))], [1], 0.0)
+def test_the_queue_decides_nothing_before_the_cycle_that_it_has_named(
+    sent: list[tuple[str, Goal]], delays: list[int], rate: float
+) -> None:
+    """Until then compiled code runs the cycles, unless something is received."""
+    rig = ControlRig()
+    meddler = Meddler(rig)
+    meddler.delays = delays
+    rig.enable()
+    rig.command("override", rate)
+    queue = rig.control.goal_queue
+
+    def decided() -> tuple[int, list[object]]:
+        return len(rig.answers), [end for end in rig.outcomes() if end[1] == "expired"]
+
+    for number, (user, goal) in enumerate(sent):
+        rig.cycle(GoalRequest(9000 + number, user, f"g{number}", goal, round((rig.now + 0.5 * PERIOD) * 1e9)))
+        for _ in range(100):
+            cycle = rig.control.modes.cycle
+            received = any(turn <= meddler.turns + 1 for turn, _ in meddler.waiting)
+            due, before = queue.due(cycle), decided()
+            rig.cycle()
+            assert received or due <= cycle or decided() == before
+
+
 class Silent(ControlRig):
     """A robot whose planner is as a test wants it to be from some time on."""
 
