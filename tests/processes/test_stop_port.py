@@ -309,6 +309,44 @@ def test_who_waits_for_his_answer_is_not_pushed_out_by_others(secured: Opened, t
     assert DONE in came
 
 
+@pytest.mark.parametrize("flood", ["silent", "half", "handshakes", "stops"])
+def test_who_waits_for_an_answer_keeps_the_connection_whatever_others_open(
+    secured: Opened, tmp_path: Path, flood: str
+) -> None:
+    locator, asked = secured
+    asked.held = []
+    contexts = {name: tls.client(Credentials.read(user(tmp_path, name))) for name in ("ann", "eva")}
+    with contextlib.ExitStack() as held:
+
+        def known(name: str) -> socket.socket:
+            return held.enter_context(contexts[name].wrap_socket(connected(locator), server_hostname="127.0.0.1"))
+
+        def ask(name: str, number: int) -> socket.socket:
+            asking = known(name)
+            asking.sendall(
+                msgspec.json.encode(StopRequest(f"trirail/demo/cmd/{name}/stop", f"{name}-{number}")) + b"\n"
+            )
+            return asking
+
+        waiting = ask("ann", 0)
+        wait_until(lambda: bool(asked.requests))
+        asked.requests.clear()
+        for number in range(3 * PLACES + 1):
+            match flood:
+                case "silent":
+                    held.enter_context(connected(locator))
+                case "half":  # the beginning of a handshake
+                    held.enter_context(connected(locator)).sendall(b"\x16\x03\x01\x02\x00\x01")
+                case "handshakes":
+                    known("eva")
+            if flood == "stops" or number % 16 == 0:
+                ask("eva", number)
+                wait_until(lambda: bool(asked.requests))  # all earlier ones have been accepted
+                asked.requests.clear()
+        asked.held[0](DONE)
+        assert b'"holding"' in waiting.recv(MAX_LINE)
+
+
 @pytest.mark.parametrize(
     ("name", "command", "code"),
     [
