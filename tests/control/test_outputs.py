@@ -372,6 +372,22 @@ def test_a_pulse_may_end_long_after_its_goal_is_done(rig: Rig, blend: float | No
     assert [(row.goal, row.value) for row in rig.switches] == [("g1", True), ("g1", False)]
 
 
+@pytest.mark.parametrize("how", ["set_output", "disable", "quick_stop"])
+def test_the_end_of_a_pulse_changes_no_output_that_was_set_or_made_safe_meanwhile(rig: Rig, how: str) -> None:
+    """Although the goal of the pulse is done, whose pulses run to their end. The light is safe when it is on."""
+    rig.set("light", False)
+    rig.send("g", PoseGoal(0.01, 0.0, 0.0, marks=(Mark("light", value=True, after_start=0.005, pulse_width=2.0),)))
+    rig.until(lambda: rig.holds() and rig.outcomes() == [("g", "done")])
+    assert rig.value("light")
+    if how == "set_output":
+        rig.set("light", True)
+    else:
+        rig.order(how)
+    for _ in range(2500):
+        rig.cycle()
+        assert rig.value("light")
+
+
 @pytest.mark.parametrize("how", ["stop", "quick_stop", "disable"])
 def test_a_stretch_is_closed_where_its_goal_is_stopped(rig: Rig, how: str) -> None:
     rig.send(
