@@ -470,6 +470,21 @@ def test_a_stop_begins_in_the_cycle_in_which_it_is_asked_for(rig: ControlRig) ->
     assert rig.control.commanded.velocity[0] < speed
 
 
+@pytest.mark.parametrize(("timeout", "code"), [(0.02, "jog_over"), (0.2, "jog_over"), (10.0, "at_limit")])
+def test_a_jog_says_whether_it_was_let_go_or_has_reached_a_limit(rig: ControlRig, timeout: float, code: str) -> None:
+    """Also where it would have reached the limit, had it not been let go."""
+    rig.enable()
+    jog = VelocityGoal(0.2, 0.0, 0.0, timeout=timeout)
+    rig.send("j1", jog)
+    rig.until(rig.holds)
+    (end,) = (notice for notice in rig.notices if notice.outcome == "done")
+    assert (end.event_code == "stopped_at_limit") == (code == "at_limit")
+    assert (rig.control.commanded.pose[0] > 0.149) == (code == "at_limit")
+    answer = rig.send("j1", jog)
+    assert isinstance(answer, Refused)
+    assert answer.code == code
+
+
 def test_a_jog_that_was_let_go_does_not_come_back(rig: ControlRig) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))

@@ -160,12 +160,13 @@ def test_a_target_beyond_the_border_is_waited_for_there(rig: ControlRig) -> None
     track(rig, lambda _: ((0.2, 0.03, 0.0), STILL), regular(50.0, 2.0))
     assert rig.mode is Mode.MOVING
     assert rig.control.commanded.pose == pytest.approx((0.15, 0.03, 0.0), abs=1e-6)
-    said = [notice.message for notice in rig.notices if notice.level == "warning"]
-    assert said == [
-        "the target of goal t1 is beyond the limit of platform x (position 150 mm); the robot waits at the limit"
-    ]
     track(rig, lambda _: ((0.1, 0.03, 0.0), STILL), regular(50.0, 1.0))
     assert rig.control.commanded.pose == pytest.approx((0.1, 0.03, 0.0), abs=1e-6)
+    track(rig, lambda _: ((0.2, 0.03, 0.0), STILL), regular(50.0, 1.0))
+    said = [notice.message for notice in rig.notices if notice.level == "warning"]
+    assert said == [  # once, however often the target crosses it
+        "the target of goal t1 is beyond the limit of platform x (position 150 mm); the robot waits at the limit"
+    ]
     assert_within_limits(rig)
 
 
