@@ -61,6 +61,10 @@ def test_a_statusword_in_a_fixed_tpdo_is_polled_unless_that_tpdo_repeats_it(
     rig.ready()
     for axis in rig.drives._axes:
         assert (axis.exchange.status, axis.exchange.polled) == (0x380 + axis.node, polled)
+    rig.enable()
+    for _ in range(50):
+        rig.cycle(rig.feedback.position)
+    assert rig.drives.prepare_tables() == (not polled)  # compiled cycles send no requests
 
 
 @pytest.mark.parametrize(("taken", "chosen", "coasts"), [((1, 2, 3), 3, False), ((1, 2), 1, False), ((2,), 2, True)])
