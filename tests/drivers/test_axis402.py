@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import msgspec
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Cia402Axis
 from trirail_drivers.cia402.one_drive import HAS_POWER
+from trirail_drivers.cia402.process_data import ACTUAL_POSITION, STATUSWORD, FeedbackPdo
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.row_updates import count_sync, end_reading
 from trirail_drivers.driver.scaling import Scale
@@ -327,3 +329,36 @@ def test_as_many_positions_may_be_missed_as_the_configuration_says(most: int) ->
             axis.on_position(canopen_frames.POSITION.pack(1000), T)
         end_reading(axis)
     assert axis.find_fault(T, WANTED) == ("B", "silent", 0, f"drive B: no position for {most} cycles in a row")
+
+
+CURRENT = 0x6078_0010
+FOLLOWING = 0x1237
+
+
+@given(
+    st.permutations([ACTUAL_POSITION, STATUSWORD]) | st.permutations([ACTUAL_POSITION, STATUSWORD, CURRENT]),
+    st.integers(0, 0xFFFF) | st.sampled_from([FOLLOWING, FOLLOWING | 0x8400, 0x0237, 0x1218]),
+    st.integers(-(2**31), 2**31 - 1),
+)
+@example([STATUSWORD, ACTUAL_POSITION], 0x1218, 1000)
+@example([ACTUAL_POSITION, STATUSWORD], 0x1218, 1000)
+def test_compiled_cycles_end_with_a_new_state_wherever_the_frame_of_the_position_has_it(
+    entries: list[int], statusword: int, counts: int
+) -> None:
+    """The position, the current and the other bits may have any values."""
+    axis = made()
+    feedback = FeedbackPdo(canopen_frames.TPDO2 + 2, tuple(entries))
+    axis.set_up(replace(axis.exchange, feedback=feedback, status=None), axis.units)
+
+    def frame(statusword: int, counts: int) -> bytes:
+        values = {ACTUAL_POSITION: counts, STATUSWORD: statusword, CURRENT: counts & 0x7FFF}
+        return b"".join(
+            values[entry].to_bytes((entry & 0xFF) // 8, "little", signed=entry != STATUSWORD) for entry in entries
+        )
+
+    axis.on_position(frame(FOLLOWING, 7), T)
+    _, length, _, mask, data, *_ = axis.expected_rows(0)[0]
+    came = frame(statusword, counts)
+    assert length == len(came)
+    expected = all(byte & bits == wanted for byte, bits, wanted in zip(came, mask, data, strict=False))
+    assert expected == (not (statusword ^ FOLLOWING) & (0x6F | canopen_frames.FOLLOWS_SETPOINTS))
