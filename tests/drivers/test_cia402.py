@@ -757,6 +757,21 @@ class TestClose:
         ramp = 0.5 / 10.0 + STANDSTILL_TIME_S
         assert enabled.clock.now - before == pytest.approx(ramp, abs=0.02)
 
+    def test_no_compiled_cycle_runs_until_drives_that_keep_power_after_their_ramp_have_lost_it(
+        self, enabled: Rig
+    ) -> None:
+        """Python alone sees that they stand; no frame says so."""
+        for device in enabled.devices:
+            device.objects[0x605A, 0].value = 6
+        enabled.move(100, (0.5, 0.5, 0.5))
+        assert enabled.drives.prepare_tables()
+        enabled.drives.quick_stop()
+        waited = 0
+        while enabled.cycle().state != OFF:
+            assert not enabled.drives.prepare_tables()
+            waited += 1
+        assert waited > STANDSTILL_TIME_S / PERIOD
+
     def test_before_and_after_a_failed_set_up(self) -> None:
         rig = Rig()
         rig.devices[0].objects[0x1000, 0].value = 0
