@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from conftest import Rig, changed
 from control.test_control import ROBOT
-from control_rig import CONFIG
+from control_rig import CONFIG, OFF, ON, ControlRig, PerfectDrives
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from trirail.kinematics.robot import inverse
-from trirail.wire.packets import Accepted
+from trirail.wire.packets import Accepted, CommandDone
 from trirail.wire.vocabulary import Mode
-from trirail_drivers.interface import PowerState
+from trirail_drivers.interface import Feedback, PowerState, Triple
 
 STEP = 0.5 * CONFIG.limits.slider.velocities[0] * CONFIG.period
 """How far a slider is pushed in a cycle [m]."""
@@ -95,3 +97,59 @@ def test_a_jammed_slider_whose_drive_is_deaf_to_the_stop_does_not_jump_when_it_c
     drive.servo.forced_velocity = None
     rig.cycles(100)
     assert abs(drive.servo.position - jammed) <= 2.0
+
+
+class SlowDrives(PerfectDrives):
+    """Perfect drives, each of which needs a time to power up, in which a person pushes its slider."""
+
+    def __init__(self, pushed: Triple, cycles: tuple[int, int, int]) -> None:
+        """`pushed`: how far each slider is pushed [m]; `cycles`: after how many cycles each drive has power."""
+        super().__init__()
+        self._pushed, self._cycles = pushed, cycles
+        self._since = 0
+        self._states = OFF
+
+    def sync(self) -> None:
+        """Push the sliders without power; those with power follow their setpoints."""
+        super().sync()
+        if self._state is ON:
+            self._since += 1
+            powered = [self._since >= own for own in self._cycles]
+            a, b, c = (
+                due if on else min(1.0, self._since * STEP / max(abs(far), STEP)) * far
+                for due, on, far in zip(self._due[0], powered, self._pushed, strict=True)
+            )
+            self._position = a, b, c
+            a, b, c = (on if has else off for has, on, off in zip(powered, ON, OFF, strict=True))
+            self._states = a, b, c
+
+    def read(self) -> Feedback:
+        """Tell which drives have power."""
+        return super().read()._replace(state=self._states)
+
+
+@settings(max_examples=60)
+@given(
+    st.tuples(*[st.floats(-0.25, 0.25)] * 2, st.floats(-1.4, 1.4)),
+    st.tuples(*[st.integers(0, 1000)] * 3),
+)
+@example((0.0, 0.0, -1.09), (1000, 1000, 1000))  # slider A beyond its travel
+@example((0.0, 0.0, 1.2), (1000, 1000, 1000))  # beyond the singular pose
+@example((0.01, 0.0, 0.1), (1000, 1000, 1000))
+@example((0.155, 0.0, 0.0), (3, 40, 1000))
+def test_sliders_pushed_during_a_power_up_are_judged_as_if_they_had_been_there_before(
+    pose: Triple, cycles: tuple[int, int, int]
+) -> None:
+    a, b, c = inverse(ROBOT, np.array(pose)).position.tolist()
+    rig = ControlRig(driver=SlowDrives((a, b, c), cycles))
+    answer = rig.command("enable")
+    before = ControlRig(driver=PerfectDrives(rig.control.measured.position))
+    assert isinstance(before.command("enable"), CommandDone) is isinstance(answer, CommandDone)
+    told, expected = ([said.message for said in one.notices if said.level != "info"] for one in (rig, before))
+    if rig.mode is Mode.HOLDING:
+        assert told == expected
+        assert len(told) <= 1
+    else:
+        assert rig.mode is Mode.FAULT
+        assert before.mode is Mode.DISABLED
+        assert told[0].startswith("all drives are enabled, but the ")

@@ -177,8 +177,8 @@ class Commands:
             raise RefusedError(RefusalCode.STOPPING, words)
         if action is Action.POWER_UP:
             self._setpoints.check_rest()
-            if self._measured.homed and (outside := self._setpoints.check_start()) is not None:
-                self._ledger.notices.append(Notice("service", "warning", outside.text, **outside.fields))
+            if self._measured.homed:
+                self._setpoints.check_start()  # the control warns once the drives have power, because of later pushes
         if action is Action.CLEAR and self._measured.powered:
             raise RefusedError(RefusalCode.STOPPING, powered_message(self._measured, self._modes.fault))
         if action is Action.CLEAR and (unready := self._measured.unready):

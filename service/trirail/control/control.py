@@ -645,7 +645,7 @@ class Control:
             if not self.measured.homed:
                 words = "all drives are enabled; the positions of the sliders are unknown: send home"
                 self.modes.apply_event(ModeEvent.POWERED, coded(words, EventCode.POWERED_NOT_HOMED))
-            elif self._rest_at_setpoints():
+            elif self._begin_holding("enabled"):
                 self.modes.apply_event(ModeEvent.POWERED, coded("all drives are enabled", EventCode.POWERED))
         elif self.modes.cycle - self.modes.entered > self._enable_cycles:
             waiting = [
@@ -667,24 +667,27 @@ class Control:
         """Change to holding once homing is complete or has been stopped."""
         if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self.schedule.runs:
             return  # the robot was not homing
-        if self.measured.homed:
-            try:
-                outside = self.setpoints.check_start()
-            except RefusedError as refusal:
-                words = f"all drives are homed, but {refusal}"
-                self.modes.trip(coded(words, EventCode.BAD_POSITION), FaultCause.PLACE)
-                return
-            if outside is not None:
-                self.ledger.notices.append(Notice("service", "warning", outside.text, **outside.fields))
-            if not self._rest_at_setpoints():
-                return
+        if self.measured.homed and not self._begin_holding("homed"):
+            return
         if self.state.mode is Mode.STOPPING:
             self.modes.apply_event(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
         else:
             self.modes.apply_event(ModeEvent.HOMED, coded("all drives are homed", EventCode.HOMED))
 
-    def _rest_at_setpoints(self) -> bool:
-        """Set the commanded motion to rest at the pose of the setpoints. If no pose matches, trip and return False."""
+    def _begin_holding(self, done: str) -> bool:
+        """Set the commanded motion to rest at the pose of the setpoints, and warn if it is outside the limits.
+
+        If the robot cannot be enabled there, or if no pose matches, trip and return False. `done` is what has happened
+        to all drives, during which the sliders may have moved.
+        """
+        try:
+            outside = self.setpoints.check_start()
+        except RefusedError as refusal:
+            words = f"all drives are {done}, but {refusal}"
+            self.modes.trip(coded(words, EventCode.BAD_POSITION), FaultCause.PLACE)
+            return False
+        if outside is not None:
+            self.ledger.notices.append(Notice("service", "warning", outside.text, **outside.fields))
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
