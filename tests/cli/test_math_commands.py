@@ -2,6 +2,7 @@
 
 import json
 import math
+import random
 import re
 import sys
 from pathlib import Path
@@ -13,10 +14,14 @@ from cyclopts import App, CycloptsError
 from matplotlib.image import imread
 from numpy.testing import assert_allclose
 from trirail.cli import math_commands
-from trirail.config import SIM
+from trirail.config import SIM, load
 from trirail.errors import KinematicsError, TrirailError
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
+from trirail.motion.motion_planner import MotionPlanner, revision
+from trirail.motion.runs import ZERO_RATES
+from trirail.wire.goals import PoseGoal
+from trirail.wire.plan_packets import NotPlanned, PlanRequest
 from trirail.workspace.singularity import conditioning, sensitivity
 
 PAPER = Geometry.symmetric(0.3)
@@ -173,6 +178,32 @@ def test_the_workspace_in_words(capsys: pytest.CaptureFixture[str]) -> None:
     for expected in ("-150.00 to 150.00", "-59.38 to 51.41", "1126.266", "814.841", "28.65", "cm²"):
         assert expected in words
     assert "-0.00" not in words
+
+
+@pytest.mark.generated(*range(30))
+def test_the_service_permits_what_its_planner_accepts_also_with_backlash(
+    seed: int, answer: Any, tmp_path: Path
+) -> None:
+    """Straight lines at one phi from the middle of the permitted slice to its corners, and just beyond them."""
+    chance, file = random.Random(seed), tmp_path / "backlash.toml"
+    backlash = [chance.choice((0.0, chance.uniform(0.0, 1e-3))) for _ in range(3)]
+    file.write_text(f"{SIM.read_text(encoding='utf-8')}\n[correction]\nbacklash = {backlash}\n", encoding="utf-8")
+    config, phi = load(file), chance.uniform(-1.0, 0.84)
+    planner = MotionPlanner(config)
+    polygon = np.array(answer(f"workspace --config {file} --phi {phi}")["slices"][0]["permitted"]["polygon"])
+    middle = polygon.mean(axis=0)
+    for corner in polygon:
+        for beyond in (-1e-5, 1e-5):
+            x, y = (corner + beyond * (corner - middle) / np.linalg.norm(corner - middle)).tolist()
+            goal, start = PoseGoal(x, y, phi), (middle[0], middle[1], phi)
+            planned = planner.plan(
+                PlanRequest(1, 1, revision(config), 0, 2, 1.0, (start, ZERO_RATES, ZERO_RATES), (), goal)
+            )
+            try:
+                warned = answer(f"ik {x} {y} {phi} --config {file}")["warnings"] != []
+            except KinematicsError:
+                warned = True
+            assert isinstance(planned, NotPlanned) is warned is (beyond > 0.0), planned
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
+from trirail.client.path_check import find_obstacle
 from trirail.config import SIM, FramesTable, Input, LegTable, Output, load
 from trirail.errors import ServiceError
 from trirail.kinematics.geometry import Geometry, Leg
@@ -25,8 +27,9 @@ from trirail.wire.records import DTYPE
 from trirail.wire.state import Info
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.workspace.part_positions import RobotParts, slider_points
-from trirail.workspace.reach import Reach
+from trirail.workspace.reach import ANGLE_STEP_RAD, Reach
 from trirail.workspace.singularity import distance_to_singularity
+from trirail_drivers.interface import Triple
 
 CONFIG = load(SIM)
 WALL_OFFSET_NS = 1_700_000_000_000_000_000
@@ -154,6 +157,21 @@ def test_sliders_are_drawn_without_the_backlash_compensation(scene: Scene) -> No
         assert values(other[path], component) == pytest.approx(values(alone[path], component), abs=1e-6, nan_ok=True), (
             path
         )
+
+
+@pytest.mark.parametrize("backlash", [(0.0, 0.0, 0.0), (1e-3, 0.0, 2e-4)])
+@pytest.mark.parametrize("phi", [-1.0, 0.0, 0.7])
+def test_the_outline_encloses_the_centres_that_the_service_accepts(backlash: Triple, phi: float) -> None:
+    robot = dataclasses.replace(DrawnRobot.from_config(CONFIG), backlash=backlash)
+    records = made.records(0.1)
+    records["pose"][:, 2] = phi = ANGLE_STEP_RAD * round(phi / ANGLE_STEP_RAD)
+    drawn = by_entity(Scene(robot, WALL_OFFSET_NS).drawn(records, ReadoutState()))["/robot/workspace"]
+    corners = values(drawn, "LineStrips2D:strips")[0, 0, :-1]
+    middle = corners.mean(axis=0)
+    for corner in corners:
+        for beyond in (-1e-5, 1e-5):
+            x, y = (corner + beyond * (corner - middle) / np.linalg.norm(corner - middle)).tolist()
+            assert (find_obstacle(robot, (*middle, phi), (x, y, phi), None, "base") is None) is (beyond < 0.0)
 
 
 def test_a_position_that_is_not_known_is_not_drawn(scene: Scene) -> None:

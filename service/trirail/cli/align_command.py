@@ -206,7 +206,7 @@ def check(
         _checked_calibration(kept, file, geometry_id(robot.info()))
         if moves:
             stage = DrawnRobot.from_info(robot.info())
-            poses = poses_within(room(stage.limits), stage.geometry, kept.calibration)
+            poses = poses_within(room(stage.planned_limits), stage.geometry, kept.calibration)
             again = repeat_calibration(kept.calibration, source.looks, poses)
             progress = _with_progress(again, service, len(poses))
             now = drive(robot, look, progress, source.speed, source.wait)

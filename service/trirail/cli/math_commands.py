@@ -12,7 +12,7 @@ from trirail.errors import KinematicsError
 from trirail.wire.units import ANGULAR_ACCELERATION, ANGULAR_VELOCITY
 
 if TYPE_CHECKING:
-    from trirail.config import Config
+    from trirail.config import Config, Limits
     from trirail.kinematics.arrays import Array
     from trirail.kinematics.geometry import Geometry
     from trirail.motion.limits import Violation
@@ -40,7 +40,8 @@ def ik(
     """Solve the inverse kinematics: the positions and rates of sliders and passive joints at a pose.
 
     A pose that the robot cannot reach, or that is closer to a singularity than configured, is an error. If only the
-    limits of the platform or of the drives forbid the pose, the command solves it and prints a warning.
+    limits of the platform or of the drives, or the travel reserved for backlash, forbid the pose, the command solves it
+    and prints a warning.
 
     Parameters
     ----------
@@ -60,6 +61,7 @@ def ik(
     import numpy as np
 
     from trirail.kinematics.robot import inverse
+    from trirail.motion.backlash_reserve import planned_limits
     from trirail.motion.limits import Bounds
     from trirail.workspace.singularity import conditioning, distance_to_singularity, sensitivity
 
@@ -72,7 +74,8 @@ def ik(
     solved = {name: values.tolist() for name, values in motion._asdict().items()}
     sensitivities = sensitivity(robot, pose)
     isotropy, distance = float(conditioning(robot, pose)), float(distance_to_singularity(robot, pose))
-    bounds = Bounds(config.limits, config.period, labels=robot.labels)
+    planned = planned_limits(config.limits, config.correction.backlash)
+    bounds = Bounds(planned, config.period, labels=robot.labels)
     refused = bounds.pose_violation(pose.tolist()), bounds.setpoint_violation(list(solved.values()))
     warnings = [str(violation) for violation in refused if violation]
     if offline.json:
@@ -175,7 +178,8 @@ def workspace(
     """Measure the workspace that the robot reaches, and the part that the service permits.
 
     The travel of sliders and platform edges and the singularity margin bound the robot's reach. The service permits
-    the part of it within limits.platform.
+    the part of it within limits.platform and without the
+    travel reserved for backlash.
 
     Parameters
     ----------
@@ -187,16 +191,17 @@ def workspace(
     deg
         Angles without a unit are in degrees.
     """
+    from trirail.motion.backlash_reserve import planned_limits
     from trirail.workspace.workspace import measure_extent, permitted_slice, polygon_area, reachable_slice
 
     config, robot = robot_of(offline)
-    limits = config.limits
-    service, reach = measure_extent(robot, limits, permitted_slice), measure_extent(robot, limits, reachable_slice)
+    limits, planned = config.limits, planned_limits(config.limits, config.correction.backlash)
+    service, reach = measure_extent(robot, planned, permitted_slice), measure_extent(robot, limits, reachable_slice)
     angles = [notation.radians(angle, deg) for angle in phi] or _round_angles(*service.phi)
-    slices = [(angle, permitted_slice(robot, limits, angle), reachable_slice(robot, limits, angle)) for angle in angles]
-    at_zero = polygon_area(permitted_slice(robot, limits, 0.0)), polygon_area(reachable_slice(robot, limits, 0.0))
+    slices = [(at, permitted_slice(robot, planned, at), reachable_slice(robot, limits, at)) for at in angles]
+    at_zero = polygon_area(permitted_slice(robot, planned, 0.0)), polygon_area(reachable_slice(robot, limits, 0.0))
     if plot:
-        _draw(plot, config, robot, angles, reach, service)
+        _draw(plot, config, robot, planned, angles, reach, service)
     if offline.json:
         terminal.json(
             {
@@ -235,13 +240,14 @@ def _round_angles(low: float, high: float) -> list[float]:
     return [math.radians(step * k) for k in range(first, last + 1)] or [(low + high) / 2.0]
 
 
-def _draw(file: Path, config: Config, robot: Geometry, angles: list[float], reach: Extent, service: Extent) -> None:
+def _draw(
+    file: Path, config: Config, robot: Geometry, planned: Limits, angles: list[float], reach: Extent, service: Extent
+) -> None:
     with terminal.drawing(file):
         from trirail.workspace import plots
 
-        plots.draw_workspace(
-            file, f"Workspace of robot {config.robot.name}", robot, config.limits, angles, reach, service
-        )
+        title = f"Workspace of robot {config.robot.name}"
+        plots.draw_workspace(file, title, robot, config.limits, planned, angles, reach, service)
 
 
 def _measures(extent: Extent, area_at_zero: float) -> dict[str, object]:

@@ -15,7 +15,6 @@ from trirail.client import trajectory
 from trirail.client.outgoing import goal_messages
 from trirail.config import Limits
 from trirail.errors import KinematicsError, RefusalCode, RefusedError, TrirailError
-from trirail.motion.backlash_reserve import planned_limits
 from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.kinds.pose import PoseMotion
 from trirail.motion.limits import Bounds, Violation
@@ -82,7 +81,7 @@ def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | No
         goal = PoseMotion.resolve(PoseGoal(x, y, phi, tool=tool, frame=frame), names, lambda _: start)
     except RefusedError as error:
         return Obstacle(str(error), code=error.code)
-    point, limits = tool_point(goal.tool), planned_limits(robot.limits, robot.backlash)
+    point, limits = tool_point(goal.tool), robot.planned_limits
     bounds = Bounds(limits, 1.0 / robot.rate_hz, labels=robot.geometry.labels)
     first, last = np.array(tool_motion(rest(start), point).pose), np.array((goal.x, goal.y, goal.phi))
     try:
@@ -147,7 +146,7 @@ def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> Checke
         goal, period = TrajectoryGoal(points, stretch=stretch), 1.0 / robot.rate_hz
         goal_messages(goal, "checked")  # the checks of the client
         _check_first_pose(robot, line[0])  # the planner lets a robot that is outside the limits stand or return
-        limits = planned_limits(robot.limits, robot.backlash)
+        limits = robot.planned_limits
         planner, schedule = GoalPlanner(robot.geometry, limits, period), Schedule(rest(line[0]), period)
         planned = planner.plan(packed(goal), schedule, 1.0, 0)
     except (TrirailError, ValueError) as error:
@@ -161,7 +160,7 @@ def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> Checke
 
 def _check_first_pose(robot: DrawnRobot, pose: Triple) -> None:
     """Raise RefusedError if a pose is outside the limits, and KinematicsError if it cannot be reached."""
-    limits = planned_limits(robot.limits, robot.backlash)
+    limits = robot.planned_limits
     outside = Bounds(limits, 1.0 / robot.rate_hz, labels=robot.geometry.labels).pose_violation(pose)
     exceeded = [outside] if outside else violations(robot.geometry, limits, pose)
     if exceeded:

@@ -16,6 +16,7 @@ from trirail.config import Config, FramesTable, Limits
 from trirail.config.tables import GeometryTable
 from trirail.errors import ConfigError, ServiceError
 from trirail.kinematics.geometry import Geometry
+from trirail.motion.backlash_reserve import planned_limits
 from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import Info
 
@@ -61,6 +62,11 @@ class DrawnRobot:
     """Digital outputs, followed by digital inputs."""
     backlash: Triple = NO_BACKLASH
     """Compensated backlash of the sliders A, B, C [m]."""
+
+    @property
+    def planned_limits(self) -> Limits:
+        """Limits that the service applies to goals."""
+        return planned_limits(self.limits, self.backlash)
 
     @classmethod
     def from_config(cls, settings: Config) -> DrawnRobot:

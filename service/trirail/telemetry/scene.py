@@ -171,7 +171,7 @@ class Scene:
         self._timelines = columns.Timelines(self._rate_hz, wall_offset_ns)
         self._geometry, self._frames = robot.geometry, robot.frames
         self._parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
-        self._reach = Reach(robot.geometry, robot.limits)
+        self._reach = Reach(robot.geometry, robot.planned_limits)
         self._plots = curves.plots(robot)
         self._digital = robot.digital
         self.bounds = self._parts.bounds

@@ -39,7 +39,14 @@ MM, CM2 = 1e3, 1e4
 
 
 def draw_workspace(
-    file: Path, title: str, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
+    file: Path,
+    title: str,
+    geometry: Geometry,
+    limits: Limits,
+    planned: Limits,
+    angles: Sequence[float],
+    reach: Extent,
+    service: Extent,
 ) -> None:
     """Draw slices of the workspace and their areas into a file. The suffix of the file selects the format.
 
@@ -51,6 +58,8 @@ def draw_workspace(
         Title of the figure.
     geometry, limits
         Geometry and limits of the robot.
+    planned : Limits
+        Limits that the service applies to goals, from backlash_reserve.planned_limits.
     angles : Sequence[float]
         Angles phi of the slices [rad].
     reach, service : Extent
@@ -72,7 +81,7 @@ def draw_workspace(
     panels = slices.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     parts = RobotParts.from_geometry(geometry, limits.slider)
     for panel, phi in zip(panels.flat, angles, strict=False):
-        _draw_slice(panel, geometry, limits, parts, phi)
+        _draw_slice(panel, geometry, limits, planned, parts, phi)
     for panel in panels.flat[len(angles) :]:
         panel.set_axis_off()
     reached = float(np.abs([*reach.x, *reach.y]).max())
@@ -87,15 +96,17 @@ def draw_workspace(
     bar = slices.colorbar(ScalarMappable(SCALE, COLOURS), ax=panels, aspect=40, pad=0.01)
     bar.set_label("conditioning of J₁⁻¹J₂   (0 singular, 1 isotropic)", color=INK, fontsize=9)
     bar.ax.tick_params(colors=GREY, labelsize=8)
-    _draw_areas(below.subplots(), geometry, limits, angles, reach, service)
+    _draw_areas(below.subplots(), geometry, planned, angles, reach, service)
     figure.savefig(file)
 
 
-def _draw_slice(panel: Axes, geometry: Geometry, limits: Limits, parts: RobotParts, phi: float) -> None:
+def _draw_slice(
+    panel: Axes, geometry: Geometry, limits: Limits, planned: Limits, parts: RobotParts, phi: float
+) -> None:
     """Draw the slice at an angle phi, with the rails, and with the platform at the origin and rotated by phi."""
     for rail in parts.rails:
         panel.plot(*(MM * rail.T), color=RAIL, linewidth=4.0, solid_capstyle="round", zorder=1)
-    reach, service = reachable_slice(geometry, limits, phi), permitted_slice(geometry, limits, phi)
+    reach, service = reachable_slice(geometry, limits, phi), permitted_slice(geometry, planned, phi)
     _draw_conditioning(panel, geometry, reach, phi, OUTSIDE_OPACITY)
     _draw_conditioning(panel, geometry, service, phi, 1.0)
     panel.add_patch(Polygon(MM * reach, fill=False, edgecolor=GREY, linewidth=0.8, zorder=4))
