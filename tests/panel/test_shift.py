@@ -17,13 +17,14 @@ from chromium import Page, needs_chromium
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
-from panel.test_page import typed
+from panel.test_page import restart, typed
 from telemetry.test_sessions import record
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.runs import centre_motion, rest, tool_motion
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import Panel
 from trirail.telemetry import contents
+from trirail.wire.state import CorrectionInfo
 from waiting import wait_until as wait
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
@@ -195,6 +196,19 @@ def test_a_file_is_checked_and_drawn_before_it_is_followed(page: Page, robot: Fa
     page.click("#stop")
     page.until("document.querySelector('#file-progress').style.visibility === 'hidden'")
     assert page.text("#file-says") == "path.csv: 4 s, within limits"
+
+
+def test_checks_without_the_map_of_as_built_errors_are_said_to_be_approximate(page: Page, robot: FakeRobot) -> None:
+    """The page's server has no map. Backlash alone it knows exactly."""
+    note = " (approximate: checked without the map of as-built errors)"
+    for greatest, words in ((0.0, ""), (1e-3, note)):
+        correction = CorrectionInfo("as_built.toml", "2026-03-01", (greatest, 0.0, 0.0), (1e-4, 1e-4, 1e-4))
+        restart(page, robot, msgspec.structs.replace(robot.told, correction=correction))
+        page.until(SHOWN)
+        typed(page, "20", "0", "0")
+        page.until_equal("document.querySelector('#going-says').textContent", f"within limits{words}")
+        choose(page, circle(4.0))
+        page.until_equal("document.querySelector('#file-says').textContent", f"path.csv: 4 s, within limits{words}")
 
 
 def test_one_that_is_too_fast_is_refused_or_slowed_where_that_is_wanted(page: Page) -> None:

@@ -66,6 +66,7 @@ def describe(info: Info, robot: DrawnRobot, user: str, role: Role | None) -> dic
         "outputs": info.outputs,
         "inputs": info.inputs,
         "sliders": robot.geometry.labels,
+        "mapped": info.correction is not None and any(info.correction.greatest),
         "resolution": MICROMETRES if platform.x[1] - platform.x[0] <= STAGE else MILLIMETRES,
         "ignores_lease": [each.value for each in Command if each.ignores_lease],
         "legs": [

@@ -140,6 +140,6 @@ export class Following {
     if (!file) return;
     const values = { name: file.name, duration: rounded(found?.duration ?? 0), slowed: rounded(found?.slowed ?? 1) };
     const key = !found ? "checking" : found.why ? "barred" : found.slowed > 1 ? "slowed" : "free";
-    byId("file-says").replaceChildren(say(`file.${key}`, values), ...(found?.why ? [" ", refusal({ ...found, message: found.why })] : []));
+    byId("file-says").replaceChildren(say(`file.${key}`, values), ...(found?.why ? [" ", refusal({ ...found, message: found.why })] : []), found && this.now().robot.mapped ? ` ${say("going.uncorrected")}` : "");
   }
 }

@@ -70,7 +70,7 @@ export class Going {
   checked({ number, obstacle: found }) {
     if (number !== this.number || !this.pose) return;
     byId("going").dataset.may = found ? "no" : "yes";
-    byId("going-says").replaceChildren(...(found ? [found.on_way ? `${say("going.on_way")} ` : "", obstacle(found)] : [say("going.free")]));
+    byId("going-says").replaceChildren(...(found ? [found.on_way ? `${say("going.on_way")} ` : "", obstacle(found)] : [say("going.free")]), this.now().robot.mapped ? ` ${say("going.uncorrected")}` : "");
     this.now().drawing?.wanted(this.centre, !found);
   }
 
