@@ -10,6 +10,7 @@ from control_rig import CONFIG, OFF, ON, ControlRig, PerfectDrives
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.kinematics.robot import inverse
+from trirail.wire.event_codes import EventCode
 from trirail.wire.packets import Accepted, CommandDone
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.interface import Feedback, PowerState, Triple
@@ -97,6 +98,27 @@ def test_a_jammed_slider_whose_drive_is_deaf_to_the_stop_does_not_jump_when_it_c
     drive.servo.forced_velocity = None
     rig.cycles(100)
     assert abs(drive.servo.position - jammed) <= 2.0
+
+
+@pytest.mark.parametrize("pushed", [0.0, 0.19])
+def test_a_slider_that_moves_while_its_brake_opens_is_held_where_it_then_is(rig: Rig, pushed: float) -> None:
+    """Without power and brake a vertical slider sags. 0.19 m is beyond the travel."""
+    for drive, seconds in zip(rig.drives, (0.0, 0.02, 0.3), strict=True):
+        drive.power_up_time = seconds
+    rig.order("enable")
+    counts = CONFIG.drives.A.direction * CONFIG.drives.A.counts_per_metre
+    for _ in range(200):
+        for drive in rig.drives:
+            if drive.state is not PowerState.OPERATION_ENABLED:
+                drive.servo.push(-pushed / 200.0 * counts)
+        rig.cycle()
+    assert not rig.holds()
+    rig.until(rig.holds)
+    rig.cycles(100)
+    assert rig.holds()
+    assert rig.control.measured.position[2] == pytest.approx(-pushed, abs=1e-6)
+    warned = [said.event_code for said in rig.notices if said.level == "warning"]
+    assert warned == [EventCode.OUTSIDE_LIMITS] * (pushed > 0.0)
 
 
 class SlowDrives(PerfectDrives):

@@ -533,6 +533,22 @@ def test_a_fault_from_every_state_and_its_reset(rig: Rig, state: PowerState) -> 
     assert rig.read(0x1001) == 0
 
 
+@pytest.mark.parametrize("then", [None, SWITCH_ON, SHUTDOWN, VOLTAGE_OFF, QUICK_STOP, "fault"])
+def test_a_power_up_takes_its_time_and_ends_at_another_command_or_a_fault(rig: Rig, then: int | str | None) -> None:
+    in_state(rig, S.SWITCHED_ON)
+    rig.drive.power_up_time = 0.1
+    for _ in range(9):
+        rig.write(0x6040, 0, pack("<H", ENABLE))
+        rig.wait(0.01)
+        assert rig.state() is S.SWITCHED_ON
+    if then == "fault":
+        rig.drive.fail(0x2310)
+    elif isinstance(then, int):
+        rig.write(0x6040, 0, pack("<H", then))
+    rig.wait(0.1)
+    assert (rig.state() is S.OPERATION_ENABLED) is (then is None)
+
+
 def test_fault_reset_needs_a_rising_edge(rig: Rig) -> None:
     rig.write(0x6040, 0, pack("<H", 0x80))
     rig.drive.fail(0x2310)

@@ -69,6 +69,9 @@ class SimulatedDrive(Device):
         self._friction = servo.max_acceleration if friction is None else friction
         self.homing = HomingMode(servo, home_switch)
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
+        self.power_up_time = 0.0
+        """Time from the command "enable operation" until the drive controls its motor [s], in which a brake opens."""
+        self._powered_at = math.inf
         self._synchronised = False
         self._moved_at = 0.0
         self._heard_period = 0.0
@@ -129,6 +132,8 @@ class SimulatedDrive(Device):
     def time_passed(self, now: float) -> None:
         """Move the axis with time, without velocity offset, unless SYNCs determine the motion; let inputs bounce."""
         self.pins.poll(now)
+        if now >= self._powered_at:
+            self._change(PowerState.OPERATION_ENABLED)
         if not self._synchronised and now > self._moved_at:
             self._move(now - self._moved_at, 0.0)
             self._moved_at = now
@@ -177,8 +182,13 @@ class SimulatedDrive(Device):
                 self.errors.clear(fault)
             return
         state = commanded(self.state, entry.value, self._profile.stays_stopped)
+        if state is not PowerState.OPERATION_ENABLED:
+            self._powered_at = math.inf
         if state is not self.state:
-            self._change(state)
+            if self.power_up_time and state is PowerState.OPERATION_ENABLED and self.state not in _POWERED:
+                self._powered_at = min(self._powered_at, self._now + self.power_up_time)
+            else:
+                self._change(state)
         elif self._homes:
             self._home(entry.value, old)
 
@@ -186,7 +196,7 @@ class SimulatedDrive(Device):
         if self.state is PowerState.OPERATION_ENABLED:
             self._setpoint_given = False
             self.homing.interrupt()
-        self.state = state
+        self.state, self._powered_at = state, math.inf
         self._profile.change(enabled=state is PowerState.OPERATION_ENABLED)
         if state is PowerState.OPERATION_ENABLED:
             self._beyond_window = None
