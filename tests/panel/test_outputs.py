@@ -34,6 +34,38 @@ def test_a_switch_sets_its_output_and_shows_its_value(page: Page, robot: FakeRob
     page.until(f"document.querySelector('{VALVE}').ariaChecked === 'false'")
 
 
+@pytest.mark.parametrize("by", ["mouse", "screen reader"])
+def test_a_press_switches_to_the_other_value_than_the_one_that_was_seen(page: Page, robot: FakeRobot, by: str) -> None:
+    """Also where another user has switched the output between press and release."""
+    page.until(f"document.querySelector('{VALVE}').ariaChecked === 'false'")
+    if by == "mouse":
+        page.press(VALVE)
+    robot.outputs["valve"] = True
+    page.until(f"document.querySelector('{VALVE}').ariaChecked === 'true'")
+    if by == "mouse":
+        page.let_go(VALVE)
+    else:
+        page.evaluate(f"document.querySelector('{VALVE}').click()")
+    wait(lambda: "set_output" in robot.commands, "the output is set")
+    page.until("document.querySelector('#answer').textContent.includes('done')")
+    assert robot.outputs["valve"] is (by == "mouse")
+
+
+def test_no_value_is_shown_without_contact_whatever_the_name(browser: Page, robot: FakeRobot) -> None:
+    """Names of what every object of the language has."""
+    robot.told = msgspec.structs.replace(robot.told, outputs=("constructor",), inputs=("valueOf",))
+    robot.outputs, robot.inputs = {"constructor": False}, {"valueOf": False}
+    shown = "[...document.querySelectorAll('#outputs b, #inputs b')].map((each) => each.textContent).join()"
+    page = browser.another()
+    with Panel(robot.robot()) as panel:
+        page.open(panel.url)
+        page.until(f"{shown} === 'off,off'")
+        robot.silent.set()
+        page.until("document.body.dataset.contact === 'none'")
+        assert page.evaluate(shown) == "–,–"
+        page.close()
+
+
 @pytest.mark.parametrize("element", ["#outputs button", "#inputs > *"])
 @pytest.mark.parametrize(("language", "words"), [("en", ["off", "on"]), ("de", ["aus", "ein"])])
 @pytest.mark.parametrize("scheme", ["light", "dark"])

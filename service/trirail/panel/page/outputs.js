@@ -24,8 +24,12 @@ export class Outputs {
       button.disabled = true;
       button.dataset.output = name;
       button.setAttribute("role", "switch");
-      button.addEventListener("click", () => {
-        const value = button.getAttribute("aria-checked");
+      const shown = () => button.getAttribute("aria-checked");
+      let pressed = null; // the value that was shown when the press began: it may change before the release
+      button.addEventListener("pointerdown", () => (pressed = shown()));
+      button.addEventListener("click", (event) => {
+        const value = event.detail === 0 ? shown() : pressed; // a key, or a screen reader, has no pointer
+        pressed = null;
         if (value === null) return; // nobody has seen what the press would change
         this.answer(say("do.set_output"));
         this.send({ do: "command", name: "set_output", content: { output: name, value: value !== "true" } });
@@ -41,7 +45,7 @@ export class Outputs {
 
   // Nobody knows the values.
   lost() {
-    this.state({ outputs: {}, inputs: {} });
+    this.state({ outputs: { __proto__: null }, inputs: { __proto__: null } });
   }
 
   // Draw where outputs will switch on the path of a goal, and where they have, until another goal has marks.
