@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import random
 import signal
 import time
 from typing import Any
@@ -16,6 +17,7 @@ from panel.conftest import SHOWN
 from panel.fake_robot import FakeRobot
 from trirail.client.held_jog import TIMEOUT
 from trirail.errors import RefusalCode, RefusedError
+from trirail.panel.description import MICROMETRES, MILLIMETRES
 from trirail.panel.server import Panel
 from trirail.wire.state import Info
 from waiting import wait_until
@@ -489,14 +491,67 @@ def test_a_pose_that_is_typed_is_checked_and_gone_to_when_told(
     assert robot.pose == pytest.approx(pose, abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("language", "words"), [("en", "a comma before exactly three digits"), ("de", "ein Punkt vor genau drei Ziffern")]
+)
 @pytest.mark.parametrize("word", ["10,000", "1,250 mm", "-125,000"])
-def test_a_comma_that_may_separate_thousands_is_no_number(word: str, enabled: Page) -> None:
+def test_a_mark_that_may_separate_thousands_is_no_number(language: str, words: str, word: str, enabled: Page) -> None:
+    enabled.show_language(language)
     typed(enabled, "1", "2", "3")
     enabled.until("document.querySelector('#going').dataset.may === 'yes'")
-    typed(enabled, word, "2", "3")
+    typed(enabled, word.replace(",", "." if language == "de" else ","), "2", "3")
     enabled.until("document.querySelector('#to-x').getAttribute('aria-invalid') === 'true'")
-    assert "may mean thousands" in enabled.text("#going-says")
+    assert words in enabled.text("#going-says")
     assert enabled.evaluate("document.querySelector('#going').dataset.may") == ""
+    enabled.evaluate("localStorage.clear()")
+
+
+@pytest.mark.parametrize("resolution", [MILLIMETRES, MICROMETRES], ids=["mm", "µm"])
+@pytest.mark.generated(0, 1, 2)
+def test_every_number_that_the_page_writes_is_read_as_the_same_value_in_every_language(
+    page: Page, resolution: dict[str, Any], seed: int
+) -> None:
+    draw = random.Random(seed)
+    values = [draw.uniform(-1.0, 1.0) * 10.0 ** draw.uniform(-6, 0) for _ in range(200)]
+    values += [round(draw.uniform(-200.0, 200.0), draw.randint(0, 4)) / resolution["scale"] for _ in range(200)]
+    found = {}
+    for language in page.evaluate("[...document.querySelector('#language').options].map((each) => each.value)"):
+        page.show_language(language)
+        found[language] = page.evaluate(
+            "(async () => { const { quantity, LENGTHS, ANGLES } = await import('./going.js');"
+            " const { typedLength, typedAngle, useResolution } = await import('./units.js');"
+            f" useResolution({json.dumps(resolution)});"
+            " const read = (text, units) =>"
+            "   [quantity(text, units),"
+            "    ...Object.keys(units).map((unit) => quantity(text + unit, units) / units[unit])];"
+            " const both = (value) => [read(typedLength(value), LENGTHS), read(typedAngle(value), ANGLES)];"
+            f" return {json.dumps(values)}.map(both); }})()"
+        )
+    page.evaluate("localStorage.clear()")
+    assert all(each == found["en"] for each in found.values())
+    last = 0.51 * 10.0 ** -(resolution["decimals"] + 2), 0.51 * 10.0 ** -(resolution["angle_decimals"] + 1)
+    for value, (length, angle) in zip(values, found["en"], strict=True):
+        number = value * resolution["scale"]
+        assert length == pytest.approx([value, *[number] * (len(length) - 1)], abs=last[0], rel=1e-12)
+        assert length[0] == pytest.approx(value, abs=last[0] / resolution["scale"])
+        assert angle[1:] == pytest.approx([math.degrees(value)] * (len(angle) - 1), abs=last[1], rel=1e-12)
+        assert angle[0] == pytest.approx(value, abs=math.radians(last[1]))
+
+
+def test_a_pose_keeps_its_place_when_the_language_changes(enabled: Page, robot: FakeRobot) -> None:
+    robot.pose = (8.125e-3, -1.234e-3, math.radians(2.345))
+    enabled.until("document.querySelector('#pose').innerText.includes('8.13 mm')")
+    enabled.click("#here")
+    for language, number in (("de", "8,125"), ("en", "8.125")):
+        enabled.show_language(language)
+        enabled.until_equal("document.querySelector('#to-x').value", number)
+        enabled.until("document.querySelector('#going').dataset.may === 'yes'")
+        enabled.write("#to-y", number)
+        enabled.click("#go")
+        wait_until(lambda: bool(robot.moved_to), "it goes")
+        at, *_ = robot.moved_to.pop()
+        assert at == pytest.approx((8.125e-3, 8.125e-3, math.radians(2.345)), abs=1e-9)
+    enabled.evaluate("localStorage.clear()")
 
 
 def test_what_is_in_the_way_is_said_before_anything_moves(enabled: Page) -> None:
@@ -534,7 +589,9 @@ def test_numbers_that_would_mean_another_place_after_a_restart_are_cleared(
     enabled.until_equal("document.querySelector('#to-x').placeholder", "µm" if changed == "unit" else "mm")
 
 
-@pytest.mark.parametrize("word", ["ten", "10 furlongs", "1.2.3", "1e3", "--5", "5 mm mm"])
+@pytest.mark.parametrize(
+    "word", ["ten", "10 furlongs", "1.2.3", "1e3", "--5", "5 mm mm", "5 constructor", "5 __proto__", "9" * 400]
+)
 def test_what_is_no_number_is_said_and_goes_nowhere(word: str, enabled: Page, robot: FakeRobot) -> None:
     before = robot.pose
     typed(enabled, "1", word, "0")

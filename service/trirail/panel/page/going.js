@@ -3,20 +3,24 @@
 import { BASE, NO_TOOL, inBase, inFrame, ofCentre, ofTool, offer } from "./frames.js";
 import { obstacle } from "./service_words.js";
 import { typedAngle, typedLength, unit } from "./units.js";
-import { onLanguage, quoted, say } from "./words.js";
+import { mark, onLanguage, quoted, say } from "./words.js";
 
-const LENGTHS = { mm: 1e-3, m: 1, cm: 1e-2, um: 1e-6, "µm": 1e-6, "μm": 1e-6, in: 0.0254 };
-const ANGLES = { "°": Math.PI / 180, deg: Math.PI / 180, rad: 1, mrad: 1e-3, "'": Math.PI / 10800, arcmin: Math.PI / 10800, '"': Math.PI / 648000, arcsec: Math.PI / 648000 };
+export const LENGTHS = { mm: 1e-3, m: 1, cm: 1e-2, um: 1e-6, "µm": 1e-6, "μm": 1e-6, in: 0.0254 };
+export const ANGLES = { "°": Math.PI / 180, deg: Math.PI / 180, rad: 1, mrad: 1e-3, "'": Math.PI / 10800, arcmin: Math.PI / 10800, '"': Math.PI / 648000, arcsec: Math.PI / 648000 };
+const THOUSANDS = /^[+\-−]?[1-9]\d{0,2}[.,]\d{3}$/;
 const AXES = ["x", "y", "phi"];
 const AGAIN = 500; // a pose is checked again after so long where the robot has moved meanwhile [ms]
 const byId = (id) => document.getElementById(id);
 
-// A number as it was typed, with its unit, in SI; null for what is none. A decimal comma is one, but not before exactly
-// three digits, as in 10,000, where it may separate thousands. Without a unit a length is in that of the page.
+// A number as it was typed, with its unit, in SI; null for what is none. Point and comma are decimal marks; but the one
+// that is not the language's may separate thousands before exactly three digits, as in 10,000 in English, and 10.000 in
+// German. Without a unit a length is in that of the page.
 export function quantity(text, units) {
-  const found = /^\s*([+\-−]?(?![1-9]\d{0,2},\d{3}(?!\d))(?:\d+[.,]?\d*|[.,]\d+))\s*([^\d\s]*)\s*$/.exec(text);
-  const size = found && units[found[2] || (units === LENGTHS ? unit() : "°")];
-  return size ? Number(found[1].replace(",", ".").replace("−", "-")) * size : null;
+  const [, digits, name] = /^\s*([+\-−]?(?:\d+[.,]?\d*|[.,]\d+))\s*([^\d\s]*)\s*$/.exec(text) ?? [];
+  const known = name || (units === LENGTHS ? unit() : "°");
+  if (!digits || !Object.hasOwn(units, known) || (THOUSANDS.test(digits) && !digits.includes(mark()))) return null;
+  const value = Number(digits.replace(",", ".").replace("−", "-")) * units[known];
+  return Number.isFinite(value) ? value : null;
 }
 
 export class Going {
@@ -31,7 +35,7 @@ export class Going {
     this.number = 0;
     this.from = null; // where the robot stood when that was checked, and when that was
     this.pose = null; // what is chosen, if it is a pose: of the tool, in the frame
-    this.meaning = ""; // the unit, tool and frame of what is typed
+    this.meaning = ""; // the unit, decimal mark, tool and frame of what is typed
     this.fields.forEach((field) => field.addEventListener("input", () => this.#typed()));
     byId("going").addEventListener("submit", (event) => {
       event.preventDefault();
@@ -40,7 +44,11 @@ export class Going {
     byId("here").addEventListener("click", () => this.choose(now().pose));
     for (const name of ["tool", "frame"])
       byId(name).addEventListener("change", () => (this.pose ? this.choose(this.centre) : this.#typed())); // the same place in other numbers
-    onLanguage(() => this.show());
+    onLanguage(() => {
+      const { centre } = this;
+      this.show();
+      this.choose(centre); // the same place in the numbers of the language
+    });
     const svg = byId("mechanism");
     svg.addEventListener("pointerdown", (event) => this.#grab(event));
     svg.addEventListener("pointermove", (event) => this.#drag(event));
@@ -52,7 +60,7 @@ export class Going {
     const { robot } = this.now();
     if (robot) offer(byId("frame"), [["base", say("frame.base")], ...Object.keys(robot.frames).map((name) => [name, name])]);
     this.fields.slice(0, 2).forEach((field) => { field.placeholder = unit(); });
-    // The same numbers would be another place, after a restart with another configuration.
+    // The same numbers may be another place, after a restart with another configuration, or in another language.
     if (this.meaning !== this.#meaning) this.fields.forEach((field) => { field.value = ""; });
     this.#typed();
   }
@@ -87,7 +95,7 @@ export class Going {
   }
 
   get #meaning() {
-    return JSON.stringify([unit(), byId("tool").value, this.#tool, byId("frame").value, this.#frame]);
+    return JSON.stringify([unit(), mark(), byId("tool").value, this.#tool, byId("frame").value, this.#frame]);
   }
 
   get #tool() {

@@ -24,6 +24,9 @@ export function number(value, digits = 0, most = digits) {
   return formats.get(key).format(value).replace("-", "−");
 }
 
+// The decimal mark of the language.
+export const mark = () => number(0.5, 1)[1];
+
 const clock = () => (language === "en" ? "en-GB" : language); // 24 hours
 export const time = (seconds) => new Date(seconds * 1e3).toLocaleTimeString(clock(), { hour12: false });
 export const date = (seconds) => new Date(seconds * 1e3).toLocaleString(clock(), { hour12: false });
