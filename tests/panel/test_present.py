@@ -107,6 +107,32 @@ def test_a_way_is_checked_again_when_the_robot_stands_elsewhere(enabled: Page, r
     assert "on the way" in enabled.text("#going-says")
 
 
+def test_no_override_is_shown_without_contact(enabled: Page, robot: FakeRobot) -> None:
+    shown = "document.querySelector('#override-says').textContent"
+    robot.share = 0.4
+    enabled.until_equal(shown, "40 %")
+    robot.silent.set()
+    enabled.until("document.body.dataset.contact === 'none'")
+    assert enabled.evaluate(shown) == "– %"
+    robot.silent.clear()
+    enabled.until_equal(shown, "40 %")
+
+
+def test_nothing_is_said_to_be_within_limits_without_contact(enabled: Page, robot: FakeRobot) -> None:
+    said = "[document.querySelector('#going').dataset.may, document.querySelector('#going-says').innerText]"
+    wanted = "document.querySelector('.wanted').parentElement.getAttribute('class')"
+    typed(enabled, "10", "0", "0")
+    enabled.until_equal(said, ["yes", "within limits"])
+    enabled.until_equal(wanted, "free")
+    robot.silent.set()
+    enabled.until("document.body.dataset.contact === 'none'")
+    assert enabled.evaluate(said) == ["", "No contact with the robot."]
+    assert enabled.evaluate(wanted) == ""
+    robot.silent.clear()
+    enabled.until_equal(said, ["yes", "within limits"])
+    enabled.until_equal(wanted, "free")
+
+
 @pytest.mark.parametrize("view", ["mechanism", "charts", "sessions"])
 def test_warnings_are_seen_in_every_view_while_they_are_in_force(page: Page, robot: FakeRobot, view: str) -> None:
     full, certificate = "nothing is recorded: the disk is full", "the certificate of ann expires in 3 days"

@@ -24,6 +24,7 @@ from trirail.motion.runs import centre_motion, rest, tool_motion
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import Panel
 from trirail.telemetry import contents
+from trirail.wire.sizes import MAX_FILE
 from trirail.wire.state import CorrectionInfo
 from waiting import wait_until as wait
 
@@ -209,6 +210,44 @@ def test_checks_without_the_map_of_as_built_errors_are_said_to_be_approximate(pa
         page.until_equal("document.querySelector('#going-says').textContent", f"within limits{words}")
         choose(page, circle(4.0))
         page.until_equal("document.querySelector('#file-says').textContent", f"path.csv: 4 s, within limits{words}")
+
+
+def test_neither_progress_nor_check_of_a_file_is_shown_without_contact(page: Page, robot: FakeRobot) -> None:
+    said = "document.querySelector('#file-says').innerText"
+    bar = "document.querySelector('#file-progress').style.visibility"
+    choose(page, circle(4.0))
+    may(page, "yes")
+    for under_way in (False, True):
+        if under_way:
+            page.click("#follow")
+            page.until_equal(said, "path.csv: 25 %, 3.0 s left")
+        robot.silent.set()
+        page.until("document.body.dataset.contact === 'none'")
+        assert page.evaluate(said) == "path.csv: No contact with the robot."
+        assert page.evaluate(bar) == "hidden"
+        assert page.evaluate("document.querySelector('#following').dataset.may") == ""
+        assert drawn(page) == ("route", 200)
+        robot.silent.clear()
+        page.until_equal(said, "path.csv: 25 %, 3.0 s left" if under_way else "path.csv: 4 s, within limits")
+        page.until_equal(bar, "" if under_way else "hidden")
+        page.until("document.querySelector('.route').getAttribute('class') === 'route free'")
+
+
+def test_a_file_that_is_chosen_while_another_is_followed_has_its_own_words(page: Page, robot: FakeRobot) -> None:
+    said = "document.querySelector('#file-says').innerText"
+    under_way = "path.csv: 25 %, 3.0 s left"
+    choose(page, circle(4.0))
+    may(page, "yes")
+    page.click("#follow")
+    page.until_equal(said, under_way)
+    choose(page, circle(5.0), "other.csv")
+    page.until_equal(said, f"{under_way}\nother.csv: 5 s, within limits")
+    page.choose_file("#file", "large.csv", "0" * (MAX_FILE + 1))
+    page.until(f"{said} === '{under_way}\\nlarge.csv is too large: a path has 5000 points at most'")
+    choose(page, circle(5.0), "other.csv")
+    page.until_equal(said, f"{under_way}\nother.csv: 5 s, within limits")
+    page.click("#stop")
+    page.until_equal(said, "other.csv: 5 s, within limits")
 
 
 def test_one_that_is_too_fast_is_refused_or_slowed_where_that_is_wanted(page: Page) -> None:

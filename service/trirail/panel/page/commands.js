@@ -69,7 +69,10 @@ export class Commands {
     const { robot, state } = this.now();
     const known = Boolean(state && robot);
     text(byId("people"), known && this.users ? say("people", { users: this.users }) : "");
-    if (!known) return text(byId("lease"), "");
+    if (!known) {
+      text(byId("lease"), "");
+      return showOverride("–");
+    }
     const { lease, override } = state;
     const since = lease && this.since?.user === lease ? say("lease.since", { time: time(this.since.time) }) : "";
     const words = lease ? (lease === robot.user ? "lease.mine" : "lease.held") : robot.lease === "required" ? "lease.required" : "lease.nobody";
@@ -88,9 +91,11 @@ function bar(control, reason) {
   if (control.title !== title) control.title = title;
 }
 
+// Show a percentage, or "–" where nobody knows it.
 function showOverride(percent) {
-  text(byId("override-says"), `${number(percent)} %`);
-  byId("override").setAttribute("aria-valuetext", `${percent} %`);
+  const words = `${percent === "–" ? percent : number(percent)} %`;
+  text(byId("override-says"), words);
+  byId("override").setAttribute("aria-valuetext", words);
 }
 
 function text(element, words) {

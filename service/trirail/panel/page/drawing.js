@@ -76,9 +76,9 @@ export class Drawing {
     if (point) this.point.setAttribute("transform", `translate(${point[0]} ${-point[1]})`);
   }
 
-  // Show a path of poses, and whether it can be followed.
+  // Show a path of poses; whether it can be followed, or null where nobody has said.
   path(poses, may) {
-    this.route.setAttribute("class", may ? "route free" : "route barred");
+    this.route.setAttribute("class", may === null ? "route" : may ? "route free" : "route barred");
     this.route.setAttribute("points", points(poses));
   }
 

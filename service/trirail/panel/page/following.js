@@ -21,7 +21,11 @@ export class Following {
     this.file = null; // number, name and bytes of what is chosen
     this.complete = false; // whether the server has it
     this.found = null; // what the server says of it
-    this.goal = null; // its goal's id, while it is under way
+    this.asked = null; // the file that was last told to be followed
+    this.goal = null; // the last goal of a file: id and file
+    this.under_way = ""; // how far that is, in words, while it is what the robot does
+    this.contact = false; // with the robot
+    this.trouble = []; // why a file could not be chosen, as of say()
     byId("choose-file").addEventListener("click", () => byId("file").click());
     byId("file").addEventListener("change", () => this.#choose(byId("file").files[0]));
     byId("stretch").addEventListener("change", () => this.#check());
@@ -37,6 +41,7 @@ export class Following {
     });
     byId("following").addEventListener("submit", (event) => {
       event.preventDefault();
+      this.asked = this.file;
       answer(say("do.follow", this.file));
       send({ do: "follow", file: this.file.number, stretch: byId("stretch").checked });
     });
@@ -81,18 +86,26 @@ export class Following {
   }
 
   accepted(id) {
-    this.goal = id;
+    this.goal = { id, file: this.asked };
   }
 
-  // How far it is, where it is what the robot does; the file's words again when it has ended.
+  // How far the file is that the robot follows; the words of the one that is chosen again when it has ended.
   state({ goal }) {
-    const runs = goal !== null && goal.id === this.goal;
+    const runs = goal !== null && goal.id === this.goal?.id;
     byId("file-progress").style.visibility = runs ? "" : "hidden";
-    if (!runs) return this.running && ((this.running = false), this.#show());
-    this.running = true;
-    byId("file-progress").value = goal.progress;
-    const words = say("file.under_way", { ...this.file, percent: number(goal.progress * 100), left: number(goal.remaining, 1) });
-    if (byId("file-says").textContent !== words) byId("file-says").textContent = words;
+    if (runs) byId("file-progress").value = goal.progress;
+    this.under_way = runs ? say("file.under_way", { ...this.goal.file, percent: number(goal.progress * 100), left: number(goal.remaining, 1) }) : "";
+    if (this.contact) return this.#say();
+    this.contact = true;
+    this.#show();
+  }
+
+  // Nobody knows how far it is, nor whether a file can be followed.
+  lost() {
+    byId("file-progress").style.visibility = "hidden";
+    this.under_way = "";
+    this.contact = false;
+    this.#show();
   }
 
   // Check it for another robot, or other limits.
@@ -103,24 +116,23 @@ export class Following {
 
   // Its drawing once more, on a robot that is drawn anew.
   draw() {
-    this.now().drawing?.path(this.found?.line ?? [], this.may);
+    this.now().drawing?.path(this.found?.line ?? [], this.contact ? this.may : null);
   }
 
   async #choose(file) {
     byId("file").value = ""; // so that the same one can be chosen again, when it has been changed
     if (!file) return;
     this.file = this.found = null;
+    this.trouble = [];
     const number = ++this.number;
-    if (file.size > this.now().robot.largest_file) {
-      byId("file-says").textContent = say("file.large", file);
-      return this.draw();
-    }
+    const refuse = (key) => {
+      this.trouble = [key, file];
+      this.#show();
+    };
+    if (file.size > this.now().robot.largest_file) return refuse("file.large");
     const content = await file.arrayBuffer().catch(() => null); // of a file that has been deleted, there is none
     if (number !== this.number) return; // another one has been chosen meanwhile
-    if (!content) {
-      byId("file-says").textContent = say("file.unreadable", file);
-      return this.draw();
-    }
+    if (!content) return refuse("file.unreadable");
     this.file = { number, name: file.name, bytes: new Uint8Array(content) };
     this.upload();
   }
@@ -133,13 +145,28 @@ export class Following {
   }
 
   #show() {
-    const { file, found } = this;
     this.draw();
     this.allow();
-    byId("following").dataset.may = found ? (this.may ? "yes" : "no") : "";
-    if (!file) return;
+    byId("following").dataset.may = this.contact && this.found ? (this.may ? "yes" : "no") : "";
+    this.#say();
+  }
+
+  // The words for the file that is under way, and for the one that is chosen, if it is another.
+  #say() {
+    const found = this.under_way && this.goal.file === this.file ? [] : this.#found();
+    const words = [this.under_way, this.under_way && found.length ? "\n" : "", ...found];
+    if (byId("file-says").textContent !== words.map((each) => each.textContent ?? each).join("")) byId("file-says").replaceChildren(...words);
+  }
+
+  // The words for the file that is chosen.
+  #found() {
+    const { file, found } = this;
+    if (this.trouble.length) return [say(...this.trouble)];
+    if (!file) return [];
+    if (!this.contact) return [say("file.barred", file), " ", say("bar.contact")];
     const values = { name: file.name, duration: rounded(found?.duration ?? 0), slowed: rounded(found?.slowed ?? 1) };
     const key = !found ? "checking" : found.why ? "barred" : found.slowed > 1 ? "slowed" : "free";
-    byId("file-says").replaceChildren(say(`file.${key}`, values), ...(found?.why ? [" ", refusal({ ...found, message: found.why })] : []), found && this.now().robot.mapped ? ` ${say("going.uncorrected")}` : "");
+    const note = found && this.now().robot.mapped ? [` ${say("going.uncorrected")}`] : [];
+    return [say(`file.${key}`, values), ...(found?.why ? [" ", refusal({ ...found, message: found.why })] : []), ...note];
   }
 }

@@ -89,6 +89,16 @@ export class Going {
     this.#check();
   }
 
+  // Nobody knows whether it is still so: check again when there is a state.
+  lost() {
+    if (!this.pose) return;
+    this.number++;
+    this.from = { pose: [NaN, NaN, NaN], at: -Infinity };
+    byId("going").dataset.may = "";
+    byId("going-says").replaceChildren(say("bar.contact"));
+    this.now().drawing?.wanted(this.centre, null);
+  }
+
   #check() {
     this.from = { pose: this.now().pose ?? [0, 0, 0], at: performance.now() };
     this.send({ do: "check", goal: this.#goal, number: ++this.number });

@@ -183,6 +183,8 @@ function lost(why, trouble = "") {
   readings.lost(say(`lost.${why}`, { trouble }));
   charts.lost();
   outputs.lost();
+  going.lost();
+  following.lost();
   line.clear();
   commands.show();
   allow();
