@@ -8,10 +8,16 @@ import { owner } from "./focus.js";
 export const EVERY = 50; // between two signs of the hand [ms]; the service brakes 200 ms after the last
 export const HUNG = 180; // a sign so late comes from a page that has hung: what it held counts no more [ms]
 
-const OWN_KEYS = "input, select, #events, #sessions"; // they, and what is in them, have other uses for these keys
+const JOGS = "html, body, button"; // keys jog where one of these has the focus; all else has other uses for them, as to scroll
 const KEYS = {
   ArrowRight: ["x", 1], ArrowLeft: ["x", -1], ArrowUp: ["y", 1], ArrowDown: ["y", -1], a: ["phi", 1], d: ["phi", -1],
 };
+
+// Whether a pointer is in the rectangle of an element, whatever lies above it.
+export function contains(element, { clientX, clientY }) {
+  const { left, right, top, bottom } = element.getBoundingClientRect();
+  return clientX >= left && clientX <= right && clientY >= top && clientY <= bottom;
+}
 
 export class Hold {
   // `sign(direction)` is told {x, y, phi}, each -1, 0 or 1, while something is held; `release()` when nothing is any more;
@@ -59,18 +65,24 @@ export class Hold {
       button.addEventListener(up, (event) => this.#up(`pointer ${event.pointerId}`));
     button.addEventListener("touchcancel", () => this.end());
     button.addEventListener("contextmenu", (event) => event.preventDefault());
+    button.addEventListener("click", (event) => event.detail === 0 && this.press(button.dataset)); // by a screen reader, which cannot hold
   }
 
   #key(event) {
     // The key's end may be told to nobody; a key in a list may open it.
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select")) return this.end();
-    const onButton = event.key === "Enter" && this.buttons.includes(event.target);
+    if (event.ctrlKey || event.metaKey || event.altKey) return this.end();
     const axis = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    if (!onButton && (!axis || event.target.closest(OWN_KEYS))) return;
+    if (event.target.closest("select")) {
+      // In a list that is closed the letter would choose another entry, by its first letter.
+      if (axis && event.key.length === 1 && event.target.matches("select")) event.preventDefault();
+      return this.end();
+    }
+    const onButton = event.key === "Enter" && this.buttons.includes(event.target);
+    if (!onButton && (!axis || !event.target.matches(JOGS))) return;
     event.preventDefault();
     if (event.repeat) return;
     const lost = owner();
-    if (lost?.closest(OWN_KEYS)) return this.barred(lost);
+    if (lost && !lost.matches(JOGS)) return this.barred(lost);
     const [name, sign] = axis ?? [];
     const matching = (each) => each.dataset.axis === name && Number(each.dataset.sign) === sign;
     this.#down(`key ${event.code}`, onButton ? event.target : this.buttons.find(matching));
@@ -109,9 +121,4 @@ export class Hold {
     if (direction.x || direction.y || direction.phi) this.sign(direction);
     else this.end(); // opposite buttons at once
   }
-}
-
-function contains(button, { clientX, clientY }) {
-  const { left, right, top, bottom } = button.getBoundingClientRect();
-  return clientX >= left && clientX <= right && clientY >= top && clientY <= bottom;
 }

@@ -8,16 +8,19 @@ import { Drawing } from "./drawing.js";
 import { Events } from "./events.js";
 import { Following } from "./following.js";
 import { Going } from "./going.js";
+import { contains } from "./hold.js";
 import { Jogging } from "./jogging.js";
 import { Naming } from "./naming.js";
 import { Outputs } from "./outputs.js";
 import { Readings } from "./readings.js";
 import { Sessions } from "./sessions.js";
 import { refusal, useLabels } from "./service_words.js";
+import "./sliders.js"; // before the others listen to sliders
 import { onLanguage, say } from "./words.js";
 
 const LEASED = { acquire: true, takeover: true, release: false }; // commands that take or give back the lease
 const SEEN = ["hold", "goal", "follow", "command", "takeover", "teach", "forget"]; // messages that carry the stamp of the newest state that was drawn
+const BUTTONS = [1, 4, 2, 8, 16, 32]; // of each button of a pointer, its bit in `buttons`
 const AGAIN = 500; // after so long a lost connection is tried again [ms]
 
 const LIGHT = matchMedia("(prefers-color-scheme: light)");
@@ -217,16 +220,53 @@ function views(group, shown = () => {}) {
 
 views("views", (view) => (view === "sessions" ? sessions.ask() : charts.draw()));
 views("ways");
-byId("stop").addEventListener("pointerdown", stop); // when it is pressed, not when it is let go
+// When it is pressed, not when it is let go; by any button of a mouse, also while another one is held, which the browser
+// tells as a move (https://www.w3.org/TR/pointerevents/#chorded-button-interactions); and whatever lies above it.
+const onStop = (event) => byId("stop").contains(event.target) || contains(byId("stop"), event);
+addEventListener("pointerdown", (event) => onStop(event) && pressed(event), true);
+addEventListener("pointermove", (event) => event.buttons & BUTTONS[event.button] && onStop(event) && pressed(event), true);
 byId("stop").addEventListener("click", (event) => event.detail === 0 && stop()); // by a key, or a screen reader
+
+function pressed(event) {
+  stop();
+  if (byId("stop").contains(event.target)) return;
+  event.preventDefault(); // as an entry of an open list
+  event.stopPropagation();
+  byId("stop").focus();
+}
+
+// STOP stays on the screen where the page is magnified, scrolled, or partly covered, as by a keyboard on the screen.
+for (const seen of [visualViewport, window])
+  for (const kind of ["resize", "scroll"])
+    seen.addEventListener(kind, () => {
+      const { scale, offsetLeft, offsetTop, height } = visualViewport;
+      byId("stop").style.transform = "";
+      const at = byId("stop").getBoundingClientRect();
+      const top = offsetTop + Math.max(0, Math.min(at.top / scale, height - at.height / scale));
+      byId("stop").style.transform = `translate(${offsetLeft + at.left / scale - at.left}px, ${top - at.top}px) scale(${1 / scale})`;
+    });
+
+// Layouts and input methods may have other names for the keys; a keyboard on a screen may tell only the text.
+const stops = ({ key, code }) => key === " " || key === "Escape" || code === "Space" || code === "Escape";
+addEventListener("beforeinput", (event) => {
+  if (event.inputType !== "insertText" || !/^\s+$/.test(event.data ?? "")) return;
+  event.preventDefault();
+  stop();
+});
+const control = ({ target }) => target.closest?.("select") ?? target; // an entry of a list belongs to it
+const began = new Map(); // where each key was pressed
+addEventListener("blur", () => began.clear());
 addEventListener(
   "keydown",
   (event) => {
     const types = event.target.matches?.("input:not([type=range])");
-    if (event.key === " " || event.key === "Escape") {
+    if (!event.repeat) began.set(event.code, control(event));
+    if (stops(event)) {
       event.preventDefault(); // also where a button or a field has the focus: Space is STOP
       event.stopPropagation();
       if (!event.repeat) stop();
+    } else if (event.repeat && event.key !== "Tab" && began.get(event.code) !== control(event)) {
+      event.preventDefault(); // a key that was pressed elsewhere, as to jog, does nothing to what has the focus later
     } else if (event.key === "Enter" && event.repeat) {
       event.preventDefault(); // a key that is held presses once, and confirms nothing
     } else if (!types && (event.key === "+" || event.key === "-") && !event.ctrlKey && !event.metaKey) {
@@ -235,7 +275,7 @@ addEventListener(
   },
   true,
 );
-addEventListener("keyup", (event) => event.key === " " && event.preventDefault(), true); // which would be its click
+addEventListener("keyup", (event) => stops(event) && event.preventDefault(), true); // which would be its click
 
 const again = () => {
   if (told) takes.robot(told);
