@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from trirail.errors import RefusedError
 from trirail.processes.incoming import Incoming
 from trirail.processes.memory_budget import Budget
 from trirail.processes.trajectory_parts import PARTS_WITHIN, TrajectoryParts
+from trirail.wire.call_mark import CallMark
 from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 from trirail.wire.kinds.trajectory import TrajectoryPart, parts
 from trirail.wire.marks import Mark, StopAt
@@ -28,11 +32,13 @@ class Rig:
         self.parts = TrajectoryParts(lambda *refused: self.refused.append(refused), lambda: self.now)
         self.budget = Budget(10**6, 10**6)
 
-    def add(self, goal: TrajectoryGoal, user: str = "ann") -> tuple[Incoming, PackedTrajectory] | None:
+    def add(
+        self, goal: TrajectoryGoal, user: str = "ann", mark: CallMark | None = None
+    ) -> tuple[Incoming, PackedTrajectory] | None:
         self.number += 1
         key = f"trirail/demo/goal/{user}"
         hold = self.budget.hold(user, 1000)
-        came = Incoming("goal", key, 1000, b"x" * 1000, "", None, self.number, number=self.number, hold=hold)
+        came = Incoming("goal", key, 1000, b"x" * 1000, "", None, self.number, number=self.number, hold=hold, mark=mark)
         return self.parts.add(came, user, goal)
 
 
@@ -115,8 +121,27 @@ def test_a_part_that_does_not_go_with_the_others_is_refused_and_says_why() -> No
         with pytest.raises(RefusedError, match=problem) as refused:
             rig.add(other)
         assert refused.value.code == "malformed"
+        ((earlier, why),) = rig.refused
+        assert (earlier.number, why) == (1, refused.value)
         assert rig.add(sent[1]) is None
-        assert rig.add(sent[2]) is not None
+        assert rig.add(sent[2]) is None  # part 1 must come again
+
+
+@given(lost=st.integers(0, 2), marked=st.booleans())
+def test_parts_of_two_calls_with_the_same_id_are_never_joined(lost: int, marked: bool) -> None:
+    """The first call has lost a part, or its program has ended; the same program sends its goal again."""
+    rig = Rig()
+    first, second = (trajectory(random.Random(seed), 3 * MAX_PART) for seed in (0, 1))
+    second = msgspec.structs.replace(second, stretch=first.stretch, settle=first.settle, valid_for=first.valid_for)
+    marks = (CallMark("0" * 12, 1), CallMark("0" * 12, 2)) if marked else (None, None)
+    whole = []
+    for call, (goal, mark) in enumerate(zip((first, second), marks, strict=True)):
+        for number, part in enumerate(parts(goal)):
+            if (call, number) == (0, lost):
+                continue
+            with contextlib.suppress(RefusedError):
+                whole += [done[1] for done in [rig.add(part, mark=mark)] if done is not None]
+    assert whole in ([packed(second)], []) if not marked else whole == [packed(second)]
 
 
 def test_more_points_than_may_be_are_refused_with_the_part_that_has_them() -> None:

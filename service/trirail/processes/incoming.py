@@ -27,9 +27,11 @@ from trirail.wire.sizes import MAX_UNREAD
 class StopPair:
     """Stop with an id, and its copy, which the client sends on the other channel: Zenoh or the stop port."""
 
-    def __init__(self, at_port: bool) -> None:
+    def __init__(self, at_port: bool, copy_within: float) -> None:
         self.at_port = at_port
         """Whether the first of the two has arrived at the stop port."""
+        self.copy_within = copy_within
+        """Time after the reply within which the copy may arrive [s]."""
         self.answer: msgspec.Struct | None = None
         """Reply to both; None until the stop is answered."""
         self.answered_at = math.inf

@@ -29,9 +29,10 @@ from trirail.wire.sizes import MAX_REFUSED
 from trirail.wire.text import is_name, quoted
 
 COPY_WITHIN_S = 2.0
-"""Time after the reply to a stop within which its copy may arrive [s].
-
-A client does not send the second copy after the reply to the first, so only a copy that is on its way is later."""
+"""Time after the reply to a stop within which its copy may arrive [s]. A program may then use the id again."""
+MARKED_COPY_WITHIN_S = 20.0
+"""The same for a stop whose id has a mark and is therefore never used again [s]. Its copy may be on its way for as long
+as Zenoh keeps a link that carries nothing, which is 10 s."""
 COPIES_KEPT = 4096
 """Maximum number of stops whose copy has not arrived. If there are more, the oldest are deleted."""
 
@@ -63,7 +64,9 @@ class Copies:
         self._pairs.pop(_id(stop), None)
         while self._pairs and (len(self._pairs) >= COPIES_KEPT or self._is_over(next(iter(self._pairs.values())))):
             del self._pairs[next(iter(self._pairs))]
-        self._pairs[_id(stop)] = pair = StopPair(_at_port(stop))
+        self._pairs[_id(stop)] = pair = StopPair(
+            _at_port(stop), COPY_WITHIN_S if stop.mark is None else MARKED_COPY_WITHIN_S
+        )
         return stop._replace(pair=pair)
 
     def answered(self, stop: Incoming, content: msgspec.Struct) -> Incoming | None:
@@ -82,7 +85,7 @@ class Copies:
         return copy
 
     def _is_over(self, pair: StopPair) -> bool:
-        return self._clock() - pair.answered_at > COPY_WITHIN_S
+        return self._clock() - pair.answered_at > pair.copy_within
 
 
 def _id(stop: Incoming) -> _Id:

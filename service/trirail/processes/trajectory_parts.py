@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.incoming import Incoming
+from trirail.wire.call_mark import CallMark
 from trirail.wire.kinds.trajectory import TrajectoryGoal
 from trirail.wire.packed_trajectory import ROW, PackedTrajectory, joined, packed
 from trirail.wire.sizes import MAX_POINTS
@@ -65,7 +66,7 @@ class TrajectoryParts:
     ) -> None:
         self._refuse = refuse
         self._clock = clock
-        self._incomplete: dict[tuple[str, str], _Incomplete] = {}
+        self._incomplete: dict[tuple[str, str, CallMark | None], _Incomplete] = {}
 
     def __iter__(self) -> Iterator[Incoming]:
         """Yield the messages that have not been answered."""
@@ -73,18 +74,24 @@ class TrajectoryParts:
 
     def is_incomplete(self, goal_id: str) -> bool:
         """Return True if some parts of the goal with this id have arrived, but not all."""
-        return any(goal_id == incomplete_id for _, incomplete_id in self._incomplete)
+        return any(goal_id == incomplete_id for _, incomplete_id, _ in self._incomplete)
 
     def add(self, incoming: Incoming, user: str, goal: TrajectoryGoal) -> tuple[Incoming, PackedTrajectory] | None:
         """Add a part. If all parts have arrived, return the whole goal and its parts as one message, else None.
 
-        Raises RefusedError if the part does not match the previous parts.
+        Only parts of one call are joined. If the part does not match the previous parts, these are refused, too: a
+        program without marks may have begun to send the goal again. Raises RefusedError for the part itself.
         """
         if goal.part is None or goal.id is None:
             return incoming, packed(goal)
-        key, (number, of) = (user, goal.id), (goal.part.number, goal.part.of)
+        key, (number, of) = (user, goal.id, incoming.mark), (goal.part.number, goal.part.of)
         incomplete = self._incomplete.get(key) or _Incomplete(of)
-        _check(incomplete, goal, number, of)
+        try:
+            _check(incomplete, goal, number, of)
+        except RefusedError as error:
+            if self._incomplete.pop(key, None) is not None:
+                self._refuse(incomplete.message, error)
+            raise
         incomplete.received[number] = _Received(incoming._replace(payload=b""), packed(goal))
         incomplete.due = self._clock() + PARTS_WITHIN
         self._incomplete[key] = incomplete
