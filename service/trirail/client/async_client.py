@@ -166,7 +166,7 @@ class AsyncRobot:
         speed, (0, 1]: at 0.5 the motion takes twice as long on the same path. With `blend` [m], the next pose goal
         waits for this goal, and begins when every point of the platform is within this distance of its place at the
         target. Without `blend`, the next goal preempts this goal. `limits` may lower the platform's limits. A goal that
-        has not begun within `valid_for` [s] expires.
+        has not begun within `valid_for` [s] of its arrival expires.
 
         `tool` is a point (u, v) [m] in the platform's frame, or the name of a point in [frames.tool]. This point then
         moves to x, y on a straight line, within the platform's limits, while the platform turns. `frame` names the

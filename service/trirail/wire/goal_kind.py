@@ -124,7 +124,7 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def valid_for(self) -> float | None:
-        """Time within which the goal must start [s]; None if there is no such time."""
+        """Time after its arrival within which the goal must start [s]; None if there is no such time."""
         return None
 
     @property
