@@ -7,6 +7,7 @@ import contextlib
 import inspect
 import json
 import queue
+import socket
 import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
@@ -26,9 +27,12 @@ from trirail.client.lease import AsyncLease
 from trirail.client.track import AsyncTrack
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import zenoh_session
+from trirail.wire.call_mark import mark_in
 from trirail.wire.goals import Goal, VelocityGoal
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
 from trirail.wire.state import GoalState, State
+from trirail.wire.stop_protocol import StopRequest, stop_address
+from trirail.wire.vocabulary import Stop
 from waiting import WITHIN
 
 
@@ -216,6 +220,54 @@ def test_a_goal_that_is_not_answered_is_stopped_if_it_was_taken(silent: Silent, 
         with pytest.raises(ServiceError):
             await sending
         assert asked[-1][1] == b'{"goal":"g"}'
+
+    run(locator, work)
+
+
+def received_at_port(listener: socket.socket) -> StopRequest:
+    """Return the next request at a stop port; it gets no answer."""
+    caller, _ = listener.accept()
+    with caller, caller.makefile("rb") as lines:
+        return msgspec.json.decode(lines.readline(), type=StopRequest)
+
+
+@pytest.fixture
+def port(locator: str) -> Iterator[socket.socket]:
+    address = stop_address(locator)
+    assert address is not None
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.settimeout(WITHIN)
+        listener.bind(str(address))
+        listener.listen()
+        yield listener
+
+
+@pytest.mark.parametrize("name", ["goal", "home"])
+def test_what_is_cancelled_is_stopped_at_the_stop_port_too(
+    silent: Silent, locator: str, port: socket.socket, name: str
+) -> None:
+    """The Zenoh link may be interrupted, which may also be why no reply arrives."""
+
+    async def work(robot: AsyncRobot) -> None:
+        call = robot.move_to(x=0.0, y=0.0, phi=0.0, id="g") if name == "goal" else robot.home()
+        began = time.monotonic_ns()
+        task = asyncio.ensure_future(call)
+        with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as query:
+            assert query.attachment is not None
+            sent = mark_in(query.attachment.to_string())
+            await cancel(task)
+        request = await asyncio.to_thread(received_at_port, port)
+        assert request.key == "trirail/demo/cmd/ann/stop"
+        assert msgspec.json.decode(request.content, type=Stop) == Stop("g" if name == "goal" else None)
+        mark = mark_in(request.id)
+        assert mark is not None
+        assert sent is not None
+        assert mark.connection == sent.connection
+        assert began <= sent.called_ns < mark.called_ns, "the service would carry the call out after the stop"
+        with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as copy:
+            shared = copy.attachment is not None and copy.attachment.to_string() == request.id
+            # The stop at the port may overtake the goal, so the service must carry out the other stop as well.
+            assert shared == (name == "home")
 
     run(locator, work)
 

@@ -393,8 +393,7 @@ class AsyncRobot:
     def _stop_unanswered(self, goal_id: str | None = None) -> None:
         """Stop a goal or homing whose sender was cancelled or received no reply, without waiting for a reply."""
         with contextlib.suppress(ServiceError):  # the connection is closed
-            stop = msgspec.json.encode(Stop(goal_id))
-            self._connection.query_unanswered(("cmd", self.user, Command.STOP), stop)
+            self._connection.stop_unanswered(self.user, Command.STOP, msgspec.json.encode(Stop(goal_id)))
 
     async def check(self, goal: Goal) -> GoalReply:
         """Plan a trirail.wire.goals.Goal without moving; return the reply that the service would give to the goal now.

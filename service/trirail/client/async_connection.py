@@ -142,6 +142,10 @@ class AsyncConnection:
         """Send a query for the key that consists of `parts`, without waiting for a reply; see Connection.query."""
         self._connection.query_unanswered(parts, payload, began)
 
+    def stop_unanswered(self, user: str, name: Command, content: bytes | None = None) -> None:
+        """Send a stop or disable to the stop port and over Zenoh, without waiting; see Connection.stop_unanswered."""
+        self._connection.stop_unanswered(user, name, content)
+
     async def nobody(self, *parts: str) -> ServiceError | RefusedError:
         """Return the error to raise if no reply arrived to a query for the key that consists of `parts`.
 

@@ -17,6 +17,7 @@ import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.call_time import called_at
+from trirail.client.outgoing import stops_everything
 from trirail.client.samples import SampleReader
 from trirail.client.stop_call import Outcome, Outcomes, StopOrder
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
@@ -36,6 +37,8 @@ REPLY_WITHIN = 20.0
 """Time-out for carrying out a command [s]."""
 HERE_WITHIN = 1.0
 """Time-out of the reply with the connected users [s]."""
+UNANSWERED_WITHIN = 2.0
+"""Time within which a stop without a reply reaches the stop port; later, the robot may move again [s]."""
 POST_WITHIN = 2.0
 """Time-out of the reply to a posted query [s]."""
 CLOSED = "the connection is closed: open a new one, as Robot(…)"
@@ -103,6 +106,22 @@ class Connection:
         handler = zenoh.handlers.Callback(_ignore, indirect=False)
         with self.open_session() as session:
             session.get(**self.query(parts, payload, REPLY_WITHIN, began), handler=handler)
+
+    def stop_unanswered(self, user: str, name: Command, content: bytes | None) -> None:
+        """Send a stop or disable to the stop port and over Zenoh, without waiting for a reply.
+
+        The stop has the present time, which is later than the call of the request that it stops. The service therefore
+        refuses this request if it arrives after the stop.
+        """
+        stop = StopOrder.create(self.robot, user, name, content, UNANSWERED_WITHIN, self.mark(time.monotonic()))
+        # The copy of a stop of one goal has no id, so that it is carried out as well: if the first copy overtakes the
+        # goal, only the copy on the goal's way comes after the goal.
+        query = self.query(stop.parts, content, REPLY_WITHIN)
+        if stops_everything(name, content):
+            query["attachment"] = stop.id
+        with self.open_session() as session:
+            stop.at_door(self._connect, self._credentials, _ignore)
+            session.get(**query, handler=zenoh.handlers.Callback(_ignore, indirect=False))
 
     def query(
         self, parts: tuple[str, ...], payload: bytes | None, within: float, began: float = math.inf
@@ -328,7 +347,7 @@ def _close(session: zenoh.Session, process: int) -> None:
         zenoh_session.close(session)
 
 
-def _ignore(_reply: zenoh.Reply) -> None:
+def _ignore(_reply: object) -> None:
     """Discard a reply."""
 
 
