@@ -22,7 +22,7 @@ from trirail.client import goal as goal_module
 from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import GoalHandle, Jog, Lease, Track
 from trirail.client.client import Robot
-from trirail.client.goal import AsyncGoalHandle, AsyncJog
+from trirail.client.goal import AsyncGoalHandle, AsyncJog, Result
 from trirail.client.lease import AsyncLease
 from trirail.client.track import AsyncTrack
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
@@ -370,24 +370,33 @@ def test_a_wait_for_a_goal_whose_end_was_missed_asks_for_the_present_goal(
     run(locator, work)
 
 
-def test_a_jog_that_is_left_while_it_is_renewed_hears_its_end_and_is_not_stopped(silent: Silent, locator: str) -> None:
+async def renewed_jog(robot: AsyncRobot, silent: Silent) -> tuple[AsyncJog, zenoh.Query, str]:
+    """Return a jog, a renewal of it that has not been answered, and its id."""
+    jog = robot.jog(x=0.01)
+    entering = asyncio.ensure_future(jog.__aenter__())
+    await asyncio.to_thread(silent.answer, GoalReply("any", 1.0))
+    await entering
+    renewal = await asyncio.to_thread(silent.asked.get, timeout=WITHIN)
+    assert renewal.payload is not None
+    return jog, renewal, json.loads(renewal.payload.to_string())["id"]
+
+
+def assert_brakes(query: zenoh.Query, name: str) -> None:
+    assert query.payload is not None
+    sent = json.loads(query.payload.to_string())
+    assert (sent["id"], sent["x"], sent["y"], sent["phi"]) == (name, 0.0, 0.0, 0.0)
+
+
+def test_a_jog_that_is_left_while_it_is_renewed_brakes_at_once_and_hears_its_end(silent: Silent, locator: str) -> None:
+    """The reply to the renewal may be late, or be lost."""
+
     async def work(robot: AsyncRobot) -> None:
-        jog = robot.jog(x=0.01)
-        entering = asyncio.ensure_future(jog.__aenter__())
-        await asyncio.to_thread(silent.answer, GoalReply("any", 1.0))
-        await entering
-        renewal = await asyncio.to_thread(silent.asked.get, timeout=WITHIN)
+        jog, renewal, name = await renewed_jog(robot, silent)
         leaving = asyncio.ensure_future(jog.__aexit__())
-        await asyncio.sleep(0)
-        with renewal:
-            assert renewal.payload is not None
-            name = json.loads(renewal.payload.to_string())["id"]
-            renewal.reply(renewal.key_expr, msgspec.json.encode(GoalReply(name, 1.0)))
-        with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as braking:
-            assert braking.payload is not None
-            sent = json.loads(braking.payload.to_string())
-            assert (sent["id"], sent["x"], sent["y"], sent["phi"]) == (name, 0.0, 0.0, 0.0)
-            braking.reply(braking.key_expr, msgspec.json.encode(GoalReply(name, 1.0)))
+        with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as braking, renewal:
+            assert_brakes(braking, name)
+            for query in (renewal, braking):
+                query.reply(query.key_expr, msgspec.json.encode(GoalReply(name, 1.0)))
         end = Event("goal", "info", "goal done: not renewed", id=name, outcome="done", seq=7, t=0.0, cycle=0, time=5.0)
         await asyncio.to_thread(silent.publish, "event", end)
         await leaving
@@ -396,6 +405,22 @@ def test_a_jog_that_is_left_while_it_is_renewed_hears_its_end_and_is_not_stopped
 
     run(locator, work)
     assert silent.asked.empty()
+
+
+@pytest.mark.parametrize("turns", [1, 2, 5])
+def test_a_jog_brakes_although_its_end_is_cancelled(silent: Silent, locator: str, turns: int) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        jog, renewal, name = await renewed_jog(robot, silent)
+        leaving = asyncio.ensure_future(jog.__aexit__())
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await cancel(leaving)
+        with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as braking, renewal:
+            assert_brakes(braking, name)
+        await asyncio.sleep(0)
+        robot._goals.end(Result(name, "done", ""))
+
+    run(locator, work)
 
 
 def test_a_subscription_ends_with_who_iterates(silent: Silent, locator: str) -> None:

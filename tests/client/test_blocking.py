@@ -480,6 +480,18 @@ def test_ctrl_c_on_the_way_to_the_first_point_of_a_path_stops_the_robot(robot: R
         assert msgspec.json.decode(stop.payload.to_bytes()) == {"goal": ids[0]}
 
 
+def test_ctrl_c_while_a_jog_ends_brakes_all_the_same(robot: Robot, slow: Slow) -> None:
+    jog = robot.jog(x=0.01, timeout=0.3)
+    entering = Call(jog.__enter__)
+    reply(slow.next(), GoalReply("any", 1.0))
+    entering.end()
+    renewal = slow.next()  # without a reply
+    interrupt(lambda: jog.__exit__(None, None, None))
+    with slow.next() as brake, renewal:
+        assert brake.payload is not None
+        assert msgspec.json.decode(brake.payload.to_bytes())["x"] == 0.0
+
+
 class InterruptedAt:
     """Raise KeyboardInterrupt in this thread before the line with a number, of those that a call executes."""
 

@@ -307,18 +307,29 @@ class AsyncJog:
 
     async def __aexit__(self, *_: object) -> None:
         self._over.set()
-        if self._renewing is not None:
-            await self._renewing  # do not cancel a renewal that has been sent
-        if self._goal is not None and self.result is None:
-            await self._brake(self._goal)
+        if self._goal is None or self._renewing is None:
+            return
+        # The brake follows a renewal that has been sent. The reply to that renewal may be late, and this call may be
+        # cancelled while it waits.
+        braking = asyncio.create_task(self._brake())
+        try:
+            await asyncio.wait([self._renewing])
+            await self._wait_for_end(self._goal, braking)
+        finally:
+            self._renewing.cancel()
+            braking.cancel()
 
-    async def _brake(self, goal: AsyncGoalHandle) -> None:
-        """Brake the robot and wait until it is at rest; after a failed renewal, for as long as the jog can last."""
+    async def _brake(self) -> None:
+        if self.result is None:
+            with contextlib.suppress(TrirailError):  # the jog has ended, or its time-out will end it
+                await self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S)
+
+    async def _wait_for_end(self, goal: AsyncGoalHandle, braking: asyncio.Task[None]) -> None:
+        """Wait until the robot is at rest; after a failed renewal, for as long as the jog can last."""
         longest = self._timeout + STANDS_WITHIN
         try:
             async with asyncio.timeout(longest if self.error else None):
-                with contextlib.suppress(TrirailError):  # the jog has ended, or its time-out will end it
-                    await self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S)
+                await braking
                 await goal.wait(longest)
         except (TrirailError, TimeoutError):
             if self.error is None:
