@@ -170,6 +170,31 @@ def test_who_is_cancelled_while_the_lease_is_granted_gives_it_back(loop: LoopThr
     assert msgspec.json.decode(given, type=ReleaseLease).id == sign(asked).id
 
 
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_who_is_cancelled_while_the_lease_ends_gives_it_back_all_the_same(turns: int) -> None:
+    asked: list[Command] = []
+
+    async def command(name: Command, _content: bytes) -> CommandReply:
+        asked.append(name)
+        if name is Command.RELEASE:
+            await asyncio.Event().wait()
+        return CommandReply(name, Mode.HOLDING, 0)
+
+    async def main() -> None:
+        lease = await AsyncLease(command, force=False, timeout=WITHIN).__aenter__()
+        leaving = asyncio.create_task(lease.__aexit__())
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        leaving.cancel()
+        await asyncio.wait([leaving])
+        assert leaving.cancelled()
+        await asyncio.sleep(0)
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    asyncio.run(main())
+    assert asked == [Command.ACQUIRE, Command.RELEASE]
+
+
 def test_ctrl_c_while_the_lease_is_granted_gives_it_back(loop: LoopThread) -> None:
     service = Silent(loop, deaf=False)
 

@@ -70,10 +70,15 @@ class AsyncLease:
         if self._over.is_set():
             return
         self._over.set()
-        if self._keeping is not None:
-            self._keeping.cancel()
-            await asyncio.wait([self._keeping])
-        await self._release()
+        # A task of its own sends the release before the first wait, at which this call may be cancelled.
+        releasing = asyncio.create_task(self._release())
+        try:
+            if self._keeping is not None:
+                self._keeping.cancel()
+                await asyncio.wait([self._keeping])
+            await releasing
+        finally:
+            releasing.cancel()
 
     async def _release(self) -> None:
         with contextlib.suppress(TrirailError):  # without a reply, the time-out ends the lease
