@@ -192,6 +192,8 @@ class OpenGoals:
         self._calls: Counter[str] = Counter()
         self._accepted: set[str] = set()
         self._switches: dict[str, dict[Switch, None]] = {}
+        self._runs: list[str] = []
+        """Runs of the service from which events have arrived; the newest is last."""
 
     def __len__(self) -> int:
         return len(self._handles)
@@ -202,11 +204,16 @@ class OpenGoals:
         return self._handles.setdefault(handle.id, handle)
 
     def accept(self, handle: AsyncGoalHandle, reply: GoalReply) -> None:
-        """Store the reply to an accepted goal; the handle remains registered until the goal ends."""
+        """Store the reply to an accepted goal; the handle remains registered until the goal ends.
+
+        If the program has blocked the event loop, an event of the next run of the service may come before the reply.
+        """
         handle.reply = reply
         self._end_call(handle.id)
         if self._handles.get(handle.id) is handle:  # otherwise the goal has already ended
             self._accepted.add(handle.id)
+            if reply.run in self._runs[:-1]:
+                self._lose(handle.id)
 
     def refuse(self, goal_id: str) -> bool:
         """Unregister a call that was refused or not answered. Return True if the handle was removed as well."""
@@ -229,11 +236,16 @@ class OpenGoals:
 
     def lose_others(self, run: str) -> None:
         """End the waits for the goals that an earlier run of the service has accepted, given its present run."""
+        self._runs = [*(name for name in self._runs if name != run), run]
         for goal_id in [name for name in self._accepted if self._handles[name].reply.run not in ("", run)]:
-            self._accepted.discard(goal_id)
-            self._switches.pop(goal_id, None)
-            handle = self._handles.pop(goal_id)
-            handle.end(None, f"the service has started again: the end of goal {goal_id} is unknown")
+            self._lose(goal_id)
+
+    def _lose(self, goal_id: str) -> None:
+        """End the wait for an accepted goal of an earlier run of the service."""
+        self._accepted.discard(goal_id)
+        self._switches.pop(goal_id, None)
+        handle = self._handles.pop(goal_id)
+        handle.end(None, f"the service has started again: the end of goal {goal_id} is unknown")
 
     def miss(self, first: int, last: int) -> None:
         """Note that the client has missed the events with the numbers from `first` to `last`."""
