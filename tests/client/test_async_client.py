@@ -193,19 +193,35 @@ def test_a_goal_whose_sending_is_cancelled_is_stopped_if_it_was_taken(silent: Si
     assert keys == ["goal/ann", 'trirail/demo/cmd/ann/stop {"goal":"g"}']
 
 
-def test_homing_whose_waiting_is_cancelled_is_stopped(silent: Silent, locator: str) -> None:
-    """The sliders would go on to their switches, for minutes, without a program that knows of it."""
+@pytest.mark.parametrize("name", ["home", "resume"])
+def test_homing_and_a_resumed_goal_are_stopped_if_the_call_is_cancelled(
+    silent: Silent, locator: str, name: str
+) -> None:
+    """The robot would move, for minutes, without a program that knows of it."""
     keys: list[str] = []
 
     async def work(robot: AsyncRobot) -> None:
-        keys.append(await cancel_when_asked(robot.home(), silent))
+        keys.append(await cancel_when_asked(getattr(robot, name)(), silent))
         with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as query:
             keys.append(str(query.key_expr))
             assert query.payload is not None
             assert query.payload.to_string() == '{"goal":null}'
 
     run(locator, work)
-    assert keys == ["cmd/ann/home", "trirail/demo/cmd/ann/stop"]
+    assert keys == [f"cmd/ann/{name}", "trirail/demo/cmd/ann/stop"]
+
+
+def test_resuming_without_a_reply_stops_the_robot(silent: Silent, locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        resuming = asyncio.ensure_future(robot.resume())
+        keys: list[str] = []
+        while not keys or not keys[-1].endswith("/stop"):
+            with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as query:  # without a reply
+                keys.append(str(query.key_expr))
+        with pytest.raises(ServiceError):
+            await resuming
+
+    run(locator, work)
 
 
 def test_a_goal_that_is_not_answered_is_stopped_if_it_was_taken(silent: Silent, locator: str) -> None:

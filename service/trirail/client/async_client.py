@@ -522,7 +522,11 @@ class AsyncRobot:
         await self._connection.fetch(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
 
     async def enable(self) -> None:
-        """Enable the drives; return when they hold the robot's position, immediately if they already do."""
+        """Enable the drives; return when they hold the robot's position, immediately if they already do.
+
+        If the call is cancelled, or no reply arrives, the service may still enable the drives: call `disable` if they
+        must not have power. The client does not, because another user may have enabled them.
+        """
         await self.command(Command.ENABLE)
 
     async def disable(self) -> None:
@@ -556,7 +560,7 @@ class AsyncRobot:
         await self.command(Command.PAUSE)
 
     async def resume(self) -> None:
-        """Continue a paused goal."""
+        """Continue a paused goal. If the call is cancelled, or no reply arrives, the robot stops."""
         await self.command(Command.RESUME)
 
     async def override(self, percent: float) -> None:
@@ -613,7 +617,7 @@ class AsyncRobot:
         try:
             reply = await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within, began=before)
         except (asyncio.CancelledError, ServiceError):
-            if command is Command.HOME:  # else the sliders would go on to their switches
+            if command in (Command.HOME, Command.RESUME):  # else the robot would move although no task waits for it
                 self._stop_unanswered()
             raise
         if command is Command.RESUME:
