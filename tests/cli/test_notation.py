@@ -265,7 +265,7 @@ PAGE = Path(app.__file__).parents[1] / "panel" / "page" / "going.js"
 @pytest.mark.parametrize(("name", "dimension"), [("LENGTHS", LENGTH), ("ANGLES", ANGLE)])
 def test_the_page_takes_the_units_of_the_command_line(name: str, dimension: Dimension) -> None:
     """The same sizes; a bare number and the signs of minutes and seconds of arc are the page's own."""
-    told = re.search(rf"^const {name} = {{ (.*) }};$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    told = re.search(rf"^export const {name} = {{ (.*) }};$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     assert told is not None
     pairs = re.findall(r"""(?:"([^"]*)"|'(.)'|(\w+)): ([^,]+)""", told[1].replace("'\"'", "'″'").replace('"\'"', "'′'"))
     sizes = {"".join(names): float(eval(size.replace("Math.PI", "math.pi"))) for *names, size in pairs}

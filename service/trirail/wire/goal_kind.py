@@ -67,7 +67,7 @@ OwnId = Annotated[
 ]
 ValidFor = Annotated[
     Annotated[float, Meta(ge=1e-3, le=86_400.0)] | None,
-    Meta(description="time within which the goal must start [s]; else it expires"),
+    Meta(description="longest time from arrival to start [s]; afterwards the goal expires"),
 ]
 Speed = Annotated[
     float,
