@@ -22,6 +22,7 @@ from trirail.client.client import Robot
 from trirail.config import SIM, Config, geometry, load
 from trirail.config.as_built import AsBuilt, format_map, geometry_of
 from trirail.errors import RefusedError, ServiceError
+from trirail.processes.cycle_core import MOST_AHEAD
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import join, read
 from trirail.telemetry.recording import Recording
@@ -219,11 +220,36 @@ def test_after_a_gap_nothing_is_compared(recording: Recording, config: Config) -
     assert compared.lacking == len(kept) - half
 
 
-def test_after_a_request_that_lacks_nothing_is_compared(recording: Recording, config: Config) -> None:
-    requests = recording.requests[:5] + recording.requests[6:]
-    compared = replay_session(recording._replace(requests=requests), config, simulated=False)
-    assert compared.cycles == recording.requests[4].cycle
-    assert compared.differing == 0
+def test_nothing_that_a_lacking_input_may_concern_is_compared(recording: Recording, config: Config) -> None:
+    """Inputs are taken away one at a time: the first of them, and some later ones."""
+    requests = recording.requests
+    together = [n for n in range(1, len(requests) - 1) if requests[n].cycle <= requests[n - 1].cycle]
+    later = random.Random(5).sample(range(12, len(requests) - 1), 8)
+    for lacking in (*range(1, 12), *together[::5], *later):
+        kept = requests[:lacking] + requests[lacking + 1 :]
+        compared = replay_session(recording._replace(requests=kept), config, simulated=False)
+        assert compared.differing == 0, (lacking, compared)
+        assert compared.cycles + compared.lacking == len(recording.records)
+        assert compared.cycles <= requests[lacking].cycle - recording.records["cycle"][0]
+        assert compared.cycles > requests[lacking - 1].cycle - recording.records["cycle"][0] - MOST_AHEAD - 1
+
+
+def test_that_the_first_cycle_lacks_an_input_is_told(recording: Recording, config: Config) -> None:
+    first, second, *others = recording.requests
+    begin = int(np.flatnonzero(recording.records["cycle"] == first.cycle)[0])
+    lacking = recording._replace(records=recording.records[begin:], requests=(first, *others))
+    with pytest.raises(ServiceError, match=f"lacks input {second.seq} of the control, .* first cycle, {first.cycle},"):
+        replay_session(lacking, config, simulated=False)
+
+
+def test_before_its_first_answer_a_recording_comes_out_the_same(recording: Recording, config: Config) -> None:
+    answered = next(what for what in recording.requests if isinstance(what.given, PreemptingMotion))
+    ends = int(np.flatnonzero(recording.records["cycle"] == answered.cycle)[0])
+    begun = tuple(what for what in recording.requests if what.cycle < answered.cycle)
+    compared = replay_session(
+        recording._replace(records=recording.records[:ends], requests=begun), config, simulated=False
+    )
+    assert (compared.cycles, compared.differing) == (ends, 0)
 
 
 def test_what_begins_in_motion_is_refused(recording: Recording, config: Config) -> None:

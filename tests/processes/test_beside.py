@@ -35,6 +35,7 @@ from trirail.control.control import Control
 from trirail.processes import loop
 from trirail.processes.cycle_caller import CycleCaller
 from trirail.processes.cycle_core import Reached
+from trirail.telemetry.recording import Recording
 from trirail.wire import links
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.marks import Mark, StopAt
@@ -96,6 +97,18 @@ def replayed(config: Config, records: NDArray[np.void], inputs: list[ControlInpu
     differs = (setpoints.view(np.int64) != commanded.view(np.int64)).any(axis=(1, 2))
     result: NDArray[np.bool] = differs | (modes != records["mode"]) | (outputs != records["outputs"]).any(axis=1)
     return result
+
+
+def check_parts(config: Config, records: NDArray[np.void], inputs: list[ControlInput]) -> None:
+    """Check replays of a session without one of the inputs around each end of cycles beside a decision."""
+    t, wall = records["cycle"] * config.period, np.zeros(len(records), "datetime64[ns]")
+    recording = Recording("demo", records, t, wall, [], {}, ())
+    ends = [n for n, each in enumerate(inputs) if each.given == DecidedAhead(0)]
+    assert ends
+    for lacking in sorted({n for end in ends for n in range(end - 2, end + 3) if 0 < n < len(inputs) - 1}):
+        requests = (*inputs[:lacking], *inputs[lacking + 1 :])
+        compared = replay.replay_session(recording._replace(requests=requests), config, simulated=False)
+        assert (compared.differing, compared.lacking > 0) == (0, True), (lacking, inputs[lacking - 3 : lacking + 2])
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -258,6 +271,7 @@ def test_a_quick_stop_in_the_second_cycle_beside_a_decision_is_handled_in_it(tmp
     finally:
         session.close()
     assert not replayed(CONFIGS["cia402"], records, inputs).any()
+    check_parts(CONFIGS["cia402"], records, inputs)
     assert MODES[records["mode"][asked[0] - 1]] is not Mode.FAULT
     assert MODES[records["mode"][asked[0]]] is Mode.FAULT
 

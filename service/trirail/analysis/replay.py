@@ -108,7 +108,8 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
     requests = [entry for entry in inputs if not isinstance(entry.given, PlanAnswer | PlannerLost)]
     number = sum(not isinstance(entry.given, DecidedAhead) for entry in requests)
     planner: _RecordedPlanner | LocalPlanner
-    if len(requests) < len(inputs) and _has_same_plans(recording, config):
+    # Recorded feedback belongs to the recorded plans, even if the recording ends before the first of them.
+    if _has_same_plans(recording, config) and (not simulated or len(requests) < len(inputs)):
         planner = _RecordedPlanner(config)
     else:
         planner, inputs = LocalPlanner(config), requests
@@ -312,16 +313,34 @@ def _due_inputs(pending: deque[ControlInput], cycle: int) -> Iterator[ControlInp
 
 
 def _replayable_part(recording: Recording) -> tuple[NDArray[np.void], list[ControlInput]]:
-    """Return the records before the first gap in the records or in the inputs, and the inputs of the same cycles."""
+    """Return the records before the first gap in the records or in the inputs, and the inputs that concern them."""
     records, inputs = recording.records, recording.requests
     steps = np.diff(records["cycle"]) != 1
     length = int(np.argmax(steps)) + 1 if steps.any() else len(records)
-    first, last = int(records["cycle"][0]), int(records["cycle"][length - 1])
+    first = int(records["cycle"][0])
     known = [entry for index, entry in enumerate(inputs) if entry.seq - inputs[0].seq == index]
     if len(known) < len(inputs):
-        # The missing input may belong to any cycle after the cycle of the last known input.
-        last = max(first, min(last, known[-1].cycle))
-    return records[: last - first + 1], [entry for entry in known if first <= entry.cycle <= last]
+        length = min(length, _first_uncertain(known) - first)
+    if length < 1:
+        raise ServiceError(
+            f"the recording lacks input {known[-1].seq + 1} of the control, which may belong to its first cycle, "
+            f"{first}, so that no cycle can be replayed. Record the session again"
+        )
+    concern = [index for index, entry in enumerate(known) if entry.cycle < first + length]
+    return records[:length], [entry for entry in known[: max(concern, default=-1) + 1] if entry.cycle >= first]
+
+
+def _first_uncertain(known: Sequence[ControlInput]) -> int:
+    """Return the first cycle to which an input may belong that is missing after the known ones.
+
+    This is the cycle of the last known input or, if that input belongs to a decision beside several cycles, the first
+    of these cycles: a missing input may have ended them (DecidedAhead).
+    """
+    last = known[-1].cycle
+    ahead = next((entry for entry in reversed(known) if isinstance(entry.given, DecidedAhead)), None)
+    if ahead is not None and isinstance(ahead.given, DecidedAhead) and ahead.cycle + ahead.given.cycles >= last:
+        return min(last, ahead.cycle)
+    return last
 
 
 def _check_recording(recording: Recording, records: NDArray[np.void], config: Config) -> None:
