@@ -697,6 +697,7 @@ class AsyncRobot:
         """Yield each event once, in order; with `history`, begin with the past events.
 
         End after `timeout` seconds without an event. On a busy machine, Zenoh may leave out the oldest past events.
+        Without `history`, the events that occur while the gateway restarts are missing.
         """
         return self._connection.events(history, seconds(timeout))
 

@@ -293,7 +293,10 @@ class Connection:
             return session.declare_subscriber(self.key("state"), self._reader.messages(State, deliver))
 
     def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
-        """Pass every event to `deliver`, even if the gateway restarts; with `history`, begin with the past events."""
+        """Pass every event to `deliver` until the subscriber's context ends; with `history`, begin with the past events.
+
+        Without `history`, the events that occur while the gateway restarts are missing.
+        """
         with self.open_session() as session:
             return declare_advanced_subscriber(
                 session,
