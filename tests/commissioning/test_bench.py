@@ -153,3 +153,29 @@ def test_a_stop_of_a_homing_is_left_its_ramp() -> None:
     speeds = np.abs(np.diff(positions)) / robot.period
     assert speeds.max() > 0.19
     assert "ran on" not in str(stopped.value)
+
+
+def test_no_drive_gets_power_while_a_slider_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that a person pushes, or that falls."""
+    with benched() as (rig, bench):
+        device = rig.devices[1]
+        poll = device.poll
+
+        def pushed(now: float) -> None:
+            device.servo.position += 20.0
+            poll(now)
+
+        monkeypatch.setattr(device, "poll", pushed)
+        with pytest.raises(DrivesStoppedError, match=r"^slider B: moved -?\d+\.\d{3} mm without power; "), bench.power():
+            pass
+        assert all(state is PowerState.SWITCH_ON_DISABLED for state in bench.feedback.state)
+
+
+def test_a_fault_that_stays_is_named_and_no_drive_gets_power() -> None:
+    with benched() as (rig, bench):
+        rig.devices[1].silent = True
+        bench.wait(0.1)
+        assert bench.feedback.fault is not None
+        with pytest.raises(DrivesStoppedError, match=r"^the fault cannot be reset: .*drive B"), bench.power("A"):
+            pass
+        assert PowerState.OPERATION_ENABLED not in bench.feedback.state
