@@ -78,8 +78,7 @@ class SetpointSender:
 
         The first `sent` setpoints are already on the bus and are not sent again.
         """
-        if self._standstill_time is not None:
-            self._brake()
+        self._brake()
         # Disabled drives are sent no setpoints: a drive that missed the command must stay where the ramp ended.
         if self.written and (enabled or self.stopping):
             self._send([(axis.wanted, axis.wanted_rate) for axis in self._axes], sent)
@@ -117,12 +116,12 @@ class SetpointSender:
                 return  # a failed send has begun a quick stop, whose setpoints are newer
 
     def _brake(self) -> None:
-        """Advance the ramp by one period. When the ramp has ended, end the quick stop, after which power is removed.
+        """Advance the ramp of a quick stop by one period. When it has ended, end the quick stop; then power is removed.
 
         While the bus accepts no setpoints, the velocity of the ramp decreases but its position does not change. A drive
         without setpoints soon stops, and must not catch up with the ramp when the bus works again.
         """
-        if not self.sent or self._standstill_time is None:
+        if self._standstill_time is None:
             return
         moving = any(axis.sent_rate for axis in self._axes)
         for axis in self._axes:
