@@ -164,6 +164,18 @@ def test_shipped_configurations_load(path: Path) -> None:
         (LISTEN, f"{TLS.replace(':7447', ':7447#enable_mtls=false')}", "settings after # would bypass [zenoh.tls]"),
         (
             LISTEN,
+            TLS.replace("\n", '\nconnect = ["tls/192.0.2.9:7447"]\n', 1),
+            "zenoh.connect: with [zenoh.tls], zenoh.router must be the name in the router's certificate",
+        ),
+        (LISTEN, f'{LISTEN}\nrouter = "hub"', "zenoh.router: this setting needs [zenoh.tls] and zenoh.connect"),
+        (
+            LISTEN,
+            TLS.replace("\n", '\nconnect = ["tls/192.0.2.9:7447"]\nrouter = "hub"\n', 1)
+            + '\n[zenoh.users]\nhub = "viewer"',
+            "zenoh.router: hub is also a user; use another name for the router",
+        ),
+        (
+            LISTEN,
             f'{LISTEN}\n[zenoh.users]\nann = "viewer"',
             "zenoh.users: without [zenoh.tls], the names of users are not verified",
         ),
@@ -270,6 +282,26 @@ def test_wrong_ones_are_refused_in_one_line(right: str, wrong: str, said: str) -
         parse(TEXT.replace(right, wrong, 1))
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "wrong", "said"),
+    [
+        (
+            "xxy",
+            "edge_point = [0.0, 0.06]",
+            "pivot = [0.0, 0.06]",
+            "leg A: pivot is allowed only with kind 3-PPR (the cross slide keeps its direction)",
+        ),
+        ("xxy", "edge_angle = 0.0\n", "\n", "geometry: leg C has no edge_angle, which kind 3-PRP needs"),
+        ("uvw-ppr", "pivot = [0.0575, 0.0575]\n", "\n", "geometry: leg B has no pivot, which kind 3-PPR needs"),
+    ],
+)
+def test_legs_with_keys_of_the_other_mechanism_are_refused(name: str, right: str, wrong: str, said: str) -> None:
+    text = (SIM.parent / f"{name}.toml").read_text()
+    assert right in text
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        parse(text.replace(right, wrong, 1))
 
 
 def test_the_file_is_named(tmp_path: Path) -> None:
