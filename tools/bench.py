@@ -6,13 +6,11 @@ Speeds are stated as ratios of two measurements in the same run, because machine
 from __future__ import annotations
 
 import json as json_format
-import os
-import signal
-import sys
 from collections.abc import Iterator
 from typing import Any
 
 from cyclopts import App
+from interruption import interrupt_on_signals
 
 app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
 
@@ -132,5 +130,5 @@ def everything(*, brief: bool = False, json: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(os.EX_TEMPFAIL))  # so that its services end, too
+    interrupt_on_signals()
     app()

@@ -26,7 +26,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from chaos_rig import EVENT_TIMEOUT_S, PROCESSES, Failed, Rig, states, wait_for
+from chaos_rig import EVENT_TIMEOUT_S, PROCESSES, Failed, Rig, running_rig, states, wait_for
+from interruption import interrupt_on_signals
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
 from trirail.wire.zenoh_session import key, open_client
@@ -219,21 +220,19 @@ def main() -> int:
     cases = [case for case in CASES if options.only in str(case)]
     if options.sample is not None and options.sample < len(cases):
         cases = random.Random(options.seed).sample(cases, options.sample)
+    if not cases:
+        arguments.error("no case is selected; a case is mode/victim/signal, such as moving/loop/KILL")
+    interrupt_on_signals()
     results: dict[str, str] = {}
     interrupted = False
-    with tempfile.TemporaryDirectory(prefix="trirail-chaos-") as folder:
-        rig = Rig(Path(folder))
-        try:
-            rig.start()
+    try:
+        with tempfile.TemporaryDirectory(prefix="trirail-chaos-") as folder, running_rig(Path(folder)) as rig:
             for case in cases:
                 results[str(case)] = result = attempt(rig, case)
                 if not options.json:
                     print(f"{case.mode:9} {case.victim:11} {case.harm:10} {result}", flush=True)
-        except KeyboardInterrupt:
-            interrupted = True
-        finally:
-            rig.clean_up()
-            rig.close()
+    except KeyboardInterrupt:
+        interrupted = True
     counts = Counter(result == "ok" for result in results.values())
     if options.json:
         print(json.dumps({"ok": counts[True], "failed": counts[False], "cases": results}))

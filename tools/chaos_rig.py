@@ -11,7 +11,7 @@ import struct
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
@@ -85,7 +85,11 @@ class Rig:
             stdout=subprocess.DEVNULL,
         )
         buses: list[UnixBus] = []
-        wait_for(lambda: _connect(self.bus_path, buses), "virtual drives")
+        try:
+            wait_for(lambda: _connect(self.bus_path, buses), "virtual drives")
+        except BaseException:
+            self._drives.terminate()
+            raise
         (self._bus,) = buses
         self._lock = threading.Lock()
         self._heard: list[can.Message] = []
@@ -123,8 +127,8 @@ class Rig:
         self._heard = []
         runtime = self.folder / "runtime"
         runtime.mkdir(exist_ok=True)
-        self._log = (self.folder / "service.log").open("w+b")
-        self.service = own_service.start(self.config, self._log, TMPDIR=str(runtime))
+        with (self.folder / "service.log").open("wb") as log:
+            self.service = own_service.start(self.config, log, TMPDIR=str(runtime))
 
     @property
     def locator(self) -> str:
@@ -186,7 +190,6 @@ class Rig:
         wait_for(lambda: not self.remains(), "killed processes are gone")
         for file in (self.folder / "recordings").glob("*"):
             file.unlink()
-        self._log.close()
 
     def recordings(self) -> list[Recording]:
         """Return all recordings of the service. Raises Failed if a file cannot be read."""
@@ -298,6 +301,17 @@ class Rig:
             elif message.arbitration_id == canopen_frames.RPDO2 + node and state == canopen_frames.ENABLE_OPERATION:
                 runs[-1].append(canopen_frames.SETPOINT.unpack(message.data)[0] / self.counts)
         return [np.array(run) for run in runs]
+
+
+@contextlib.contextmanager
+def running_rig(folder: Path) -> Iterator[Rig]:
+    """Run drives and a first service; at the end of the context, also after a failed start, end what still runs."""
+    with contextlib.closing(Rig(folder)) as rig:
+        rig.start()
+        try:
+            yield rig
+        finally:
+            rig.clean_up()
 
 
 def _python(*arguments: str) -> list[str]:

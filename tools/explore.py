@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from interruption import interrupt_on_signals
 
 ROOT = Path(__file__).parents[1]
 NICE = 10
@@ -161,9 +162,7 @@ def main() -> int:
     arguments.add_argument("--seed", type=int, help="seed of the examples; random if absent")
     arguments.add_argument("--json", action="store_true", help="print one JSON object")
     options = arguments.parse_args()
-    signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # a shell makes background jobs ignore SIGINT, and pytest would inherit this
+    interrupt_on_signals()
     seed = random.SystemRandom().randrange(2**32) if options.seed is None else options.seed
     with tempfile.TemporaryDirectory(prefix="trirail-explore-") as folder:
         cores = [Core(Path(folder), number, seed, options.only) for number in range(os.cpu_count() or 1)]

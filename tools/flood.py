@@ -35,6 +35,7 @@ from typing import NamedTuple
 import flood_memory
 import zenoh
 from flood_memory import memory
+from interruption import interrupt_on_signals
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
@@ -150,10 +151,11 @@ class Flood:
             with contextlib.suppress(zenoh.ZError):  # the service may have closed the connection
                 if kind == "states" or rnd.random() < 0.3:
                     one.put(key, payload, encoding=encoding)
+                    self.sent[kind] += 1
                 elif pending.acquire(timeout=5.0):
                     handler = zenoh.handlers.Callback(over, drop=pending.release, indirect=False)
                     one.get(key, handler, payload=payload, encoding=encoding, timeout=5.0)
-            self.sent[kind] += 1
+                    self.sent[kind] += 1
             if self._over.wait(self._pause):
                 return
 
@@ -187,6 +189,13 @@ def _flood(locator: str, ports: tuple[int, ...], rate: float, seconds: float, de
         time.sleep(seconds)
     results.send((flood.sent, flood.answered))
     os._exit(0)
+
+
+def _received(results: Connection) -> Iterator[tuple[Counter[str], int]]:
+    """Yield the counts of messages and answers that processes send, until all these processes have ended."""
+    with contextlib.suppress(EOFError):
+        while True:
+            yield results.recv()
 
 
 @contextlib.contextmanager
@@ -276,18 +285,24 @@ def run(seconds: float, rate: float) -> list[str]:
             ]
             for one in floods:
                 one.start()
+            sender.close()  # the floods have the only other copies: `heard` ends with them
             with sampled(pids, seconds / SAMPLES) as samples:
                 accepted, stops = use(locator, seconds)
-            sent, answered = max((heard.recv() for _ in floods), key=lambda counts: sum(counts[0].values()))
+            counts = list(_received(heard))
             for one in floods:
                 one.join()
+            if len(counts) < len(floods):
+                return ["a process of the flood has failed, see above"]
+            sent, answered = max(counts, key=lambda counted: sum(counted[0].values()))
             after = memory(pids)
             print(f"{sum(sent.values())} messages of {len(sent)} kinds in {seconds:g} s, {answered} answers")
             print(f"{accepted} goals taken, {len(stops)} stops, the slowest answered in {max(stops):.2f} s")
             for process in pids:
                 meanwhile = " ".join(f"{sample[process]:.0f}" for sample in samples)
                 print(f"{process:12}{before[process]:5.0f} MB before, {meanwhile}, {after[process]:.0f} after")
-            return [*_failures(robot, service.pid, pids, before, after, stops, seconds), *_page_failures(page)]
+            unheard = [] if answered else ["the service has answered no message of the flood"]
+            failures = _failures(robot, service.pid, pids, before, after, stops, seconds)
+            return [*unheard, *failures, *_page_failures(page)]
 
 
 def _failures(
@@ -333,6 +348,7 @@ def main() -> int:
     parser.add_argument("seconds", type=float)
     parser.add_argument("--rate", type=float, default=3000.0, help="messages a second at most, of all sessions")
     arguments = parser.parse_args()
+    interrupt_on_signals()
     logging.getLogger("trirail").disabled = True  # every client would log skipped messages
     try:
         failures = run(arguments.seconds / 2, arguments.rate)

@@ -234,6 +234,8 @@ def _stays(flood: str, sender: BaseProcess, pids: dict[str, int], before: dict[s
         greatest = max(greatest, _most(memory(pids), before))
         sender.join(SAMPLE_EVERY)
     print(f"{flood:32} {greatest[0]:+5.0f} MB ({greatest[1]})")
+    if sender.exitcode:
+        yield f"{flood}: the flood itself has failed, see above"
     if greatest[0] > GROWS_BY:
         yield f"{flood}: the {greatest[1]} took {greatest[0]:.0f} MB more"
 

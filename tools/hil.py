@@ -15,13 +15,11 @@ import argparse
 import json
 import os
 import shutil
-import signal
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import bus_log
@@ -32,6 +30,7 @@ from hil_dissector import Dissected
 from hil_machine import ROOT, STEPS, begin_compiling, compiling, machine, output_lines, pack
 from hil_needs import install, last, requirements
 from hil_programs import Failed, changed
+from interruption import interrupt_on_signals
 from trirail.config import Config, load
 
 CHANGES = {
@@ -73,7 +72,7 @@ def main() -> int:
     parser.add_argument("--prepare", action="store_true", help="only compile what runs in the machine")
     options = parser.parse_args()
 
-    signal.signal(signal.SIGTERM, _interrupt)
+    interrupt_on_signals()
     say = Progress(sys.stderr if options.json else sys.stdout)
     steps = STEPS if options.only is None else (options.only,)
     report: dict[str, Any] = {"ok": False, "checks": {}, "failure": None, "not_shown": NOT_SHOWN}
@@ -125,10 +124,6 @@ class Progress:
     def __call__(self, line: str) -> None:
         """Print a line."""
         print(f"{time.monotonic() - self._began:5.0f} s  {line}", file=self._stream, flush=True)
-
-
-def _interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def run(

@@ -9,13 +9,11 @@ transmits the frames, and the servo uses only its own units. tools/hil.py runs t
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 
 import can
 from trirail.config import load
@@ -24,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from drivers.foreign import DISABLED, ENABLED, FAULT, ON, QUICK_STOP, REACTION, READY, ForeignDrive, Truth
 from hil_second import COUNTS, MAKE, REVOLUTIONS
+from interruption import interrupt_on_signals
 from virtual_drives import bus_to_be_on
 
 STEP = 0.005
@@ -93,15 +92,11 @@ def main() -> int:
     arguments.add_argument("--interface", required=True, help="a python-can interface")
     arguments.add_argument("--channel", required=True, help="the interface's channel")
     options = arguments.parse_args()
-    signal.signal(signal.SIGTERM, _interrupt)
+    interrupt_on_signals()
     config = load(options.config)
     with suppress(KeyboardInterrupt), bus_to_be_on(options.interface, options.channel, config) as bus:
         serve(LastingBus(bus), config.drives.C.node, lambda line: print(line, flush=True), lambda: True)
     return 0
-
-
-def _interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from interruption import interrupt_on_signals
 from trirail.client import own_service
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
@@ -43,6 +44,7 @@ def main() -> None:
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         raise SystemExit("no Chromium here: install it (Debian: apt-get install chromium)")
+    interrupt_on_signals()
     with tempfile.TemporaryDirectory(prefix="trirail-", ignore_cleanup_errors=True) as folder:
         config, locator = own_service.private(Path(folder))
         os.environ["STATE_DIRECTORY"] = folder  # separates the taught poses from the user's poses

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from interruption import interrupt_on_signals
 from PIL import Image
 from rerun.experimental import ViewerClient
 from trirail.processes.operating_system import python
@@ -40,6 +41,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if not arguments.recording.is_file():
         parser.error(f"{arguments.recording} is not a file")
+    interrupt_on_signals()
     width, height = (int(number) for number in arguments.size.split("x"))
     with viewer(arguments.recording, width, height) as client:
         if arguments.at is not None:

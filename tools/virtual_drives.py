@@ -13,14 +13,13 @@ import argparse
 import contextlib
 import os
 import select
-import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
 
 import can
 import msgspec
+from interruption import interrupt_on_signals
 from trirail.config import Config, load
 from trirail.errors import TrirailError
 from trirail_drivers.bus.unixbus import UnixBus
@@ -130,8 +129,7 @@ def main() -> int:
     arguments.add_argument("--seed", type=int, default=0, help="what faults that come by chance begin with")
     options = arguments.parse_args()
 
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _interrupt)
+    interrupt_on_signals()
     try:
         config = load(options.config)
         with (
@@ -162,10 +160,6 @@ def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
 def print_now(text: str) -> None:
     """Print a line immediately, even if standard output is a pipe."""
     print(text, flush=True)
-
-
-def _interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":
