@@ -68,6 +68,8 @@ def block(results: dict[str, Any], *, brief: bool) -> Iterator[str]:
     if "missed" in loop:
         lost = loop["lost_by_the_machine"]
         yield f"Of {loop['cycles']} cycles {loop['missed']} ticks were missed; the machine itself lost {lost}."
+    if "not_kept" in loop:
+        yield f"The loop did not keep {loop['rate_hz']} Hz: {loop['not_kept']}."
     for name, result in results.items():
         if result is None:
             yield f"{name}: failed, see the messages above."

@@ -35,6 +35,12 @@ def test_a_failed_measurement_is_named(failed: str) -> None:
     assert "not for comparison" in block[0]
 
 
+def test_a_rate_that_is_not_kept_is_named() -> None:
+    loop = {"rate_hz": 1000, "not_kept": "90 faults in 60 s, the last: drive A is silent"}
+    block = list(on_a_pi.block(RESULTS | {"loop": {"rates": [loop]}}, brief=False))
+    assert block[-1] == "The loop did not keep 1000 Hz: 90 faults in 60 s, the last: drive A is silent."
+
+
 def test_the_report_is_made_on_this_machine(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
