@@ -52,6 +52,14 @@ def test_each_list_finds_what_it_is_for() -> None:
     assert list(places_in_python(PLAIN)) == []
 
 
+@pytest.mark.parametrize("path", ["service/trirail/wires", "./service", "tests"])
+def test_a_path_without_files_is_not_plain(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["plain_language.py", "service/trirail/naming.py", path])
+    with pytest.raises(SystemExit) as ended:
+        plain_language.main()
+    assert ended.value.code == 2
+
+
 @pytest.mark.parametrize(
     ("text", "number"),
     [

@@ -144,14 +144,18 @@ def main() -> int:
     """Print the places in the given folders and files, or everywhere; return 1 if one of them is not an exception."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("paths", nargs="*", default=[""], help="folders and files; default: all")
-    paths = parser.parse_args().paths
-    reasons, left = exceptions(), 0
-    for file in files():
-        if any(file == path or file.startswith(path and path.rstrip("/") + "/") for path in paths):
-            for place in places(file):
-                reason = reasons.get(place.key)
-                left += reason is None
-                print(f"{place.file}:{place.line}: {place.rule}: {place.text}" + (f" ({reason})" if reason else ""))
+    reasons, left, known = exceptions(), 0, files()
+    chosen = set()
+    for path in parser.parse_args().paths:
+        below = [file for file in known if file == path or file.startswith(path and path.rstrip("/") + "/")]
+        if not below:
+            parser.error(f"{path}: no file to check; a path is relative to {ROOT}, and not in tests/")
+        chosen.update(below)
+    for file in sorted(chosen):
+        for place in places(file):
+            reason = reasons.get(place.key)
+            left += reason is None
+            print(f"{place.file}:{place.line}: {place.rule}: {place.text}" + (f" ({reason})" if reason else ""))
     return int(left > 0)
 
 
