@@ -129,6 +129,8 @@ def differences(own: Sequence[Frame], log: Sequence[Frame], until: float) -> lis
     The frames of the service's log must be a contiguous part of those on the bus.
     """
     here, there = _by_identifier([frame for frame in own if frame.t < until]), _by_identifier(log)
+    if layout.SYNC not in here:
+        return ["the service's log has no SYNC: nothing was captured"]
     lines = []
     for identifier, frames in here.items():
         heard = there.get(identifier, [])

@@ -81,7 +81,7 @@ def problems(frames: Sequence[Dissected], until: float) -> list[str]:
     receives nothing is sent a stop without a wait for its answer.
     """
     calm = [frame for frame in frames if frame.t < until]
-    return [*_unreadable(frames), *_unanswered(calm), *_fallen(calm)]
+    return [*_unreadable(frames), *_foreign(calm), *_unanswered(calm), *_fallen(calm)]
 
 
 class Switch(NamedTuple):
@@ -124,6 +124,13 @@ def _unreadable(frames: Sequence[Dissected]) -> Iterator[str]:
     for frame in frames:
         if frame.malformed:
             yield f"malformed, says Wireshark: function code {frame.function}, node {frame.node}, at {frame.t:.6f}"
+
+
+def _foreign(frames: Sequence[Dissected]) -> Iterator[str]:
+    """Yield a line if the dissector has not decoded every frame as CANopen; without a frame, nothing is proved."""
+    undecoded = sum(frame.function is None for frame in frames)
+    if undecoded or not frames:
+        yield f"{undecoded} of {len(frames)} frames are not CANopen, says Wireshark"
 
 
 def _unanswered(frames: Sequence[Dissected]) -> Iterator[str]:

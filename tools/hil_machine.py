@@ -32,6 +32,8 @@ TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py", "te
 STEPS = "robots", "fd", "tests"
 """Steps in the machine: two robots on classical CAN, a robot on CAN FD, and the tests marked vcan."""
 
+IMAGE = "python.img"
+"""Name of the disk image with Python."""
 COMPILED = "compiled"
 """Name of the file with the outcome of compiling. The machine waits for this file."""
 CACHE = Path(sys.prefix) / "hil-numba"
@@ -68,7 +70,6 @@ def compiling(folder: Path) -> Iterator[None]:
 
     Raises Failed at the end of the context if compiling has failed.
     """
-    (folder / COMPILED).unlink(missing_ok=True)  # it may be left from a previous run
     with (folder / "compile.log").open("wb") as log:
         process = begin_compiling(folder / COMPILED, stdout=log, stderr=log)
     try:
@@ -90,7 +91,7 @@ def pack(folder: Path) -> tuple[Path, ...]:
     library, packages = (Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib"))
     done = subprocess.run(
         (
-            *("mksquashfs", library, packages, folder / "python.img"),
+            *("mksquashfs", library, packages, folder / IMAGE),
             *("-no-strip", "-noappend", "-no-progress", "-quiet", "-noI", "-noD", "-noF", "-noX"),
             *("-wildcards", "-e", str(library / "site-packages").lstrip("/"), *(f"... {name}" for name in UNUSED)),
         ),
@@ -175,7 +176,7 @@ def machine(
     """
     (folder / "machine.sh").write_text(script(folder, packed, steps))
     devices = (
-        f"-drive file={folder}/python.img,format=raw,if=virtio,readonly=on",
+        f"-drive file={folder}/{IMAGE},format=raw,if=virtio,readonly=on",
         "-cpu Nehalem",  # the minimum for Python's packages: emulating AVX halves the speed
         "-object can-bus,id=bus -device kvaser_pci,canbus=bus -device kvaser_pci,canbus=bus",
     )

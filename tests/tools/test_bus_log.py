@@ -71,6 +71,12 @@ def test_a_right_log_has_no_problems() -> None:
     assert bus_log.statistics(GOOD, CONFIG, 9e9)["interval_median_ms"] == pytest.approx(PERIOD * 1e3)
 
 
+@pytest.mark.parametrize("own", [[], [frame for frame in GOOD if frame.identifier != layout.SYNC]])
+def test_a_log_of_the_service_without_its_frames_proves_nothing(own: list[Frame]) -> None:
+    assert bus_log.differences(own, GOOD, 9e9) == ["the service's log has no SYNC: nothing was captured"]
+    assert bus_log.differences(GOOD, GOOD, GOOD[0].t) != []  # all its frames are later
+
+
 def moving(frame: Frame) -> bool:
     return frame.identifier == layout.RPDO2 + 2 and frame.t > 1.1
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import queue
+import re
 import struct
 import tempfile
 import threading
@@ -174,11 +178,68 @@ def test_changes_of_the_foreign_drives_outputs_are_compared_with_the_table() -> 
 
 
 def test_the_time_limit_says_what_was_heard_last() -> None:
-    import queue
-
     lines: queue.Queue[str | None] = queue.Queue()
     lines.put("the machine is up")
     heard = hil_machine.output_lines(lines, 0.0)
     assert next(heard) == "the machine is up"
     with pytest.raises(Failed, match="the machine is up"):
         next(heard)
+
+
+def ends_at_once(monkeypatch: pytest.MonkeyPatch, *options: str) -> int:
+    """Run tools/hil.py with a machine that ends before its first step; return the exit code."""
+    lines: queue.Queue[str | None] = queue.Queue()
+    lines.put(None)
+    image: list[Path] = []
+
+    def pack(folder: Path) -> tuple[Path, ...]:
+        image.append(folder / "python.img")
+        image[0].touch()
+        return ()
+
+    monkeypatch.setattr(hil, "requirements", lambda: Path("vmlinuz"))
+    monkeypatch.setattr(hil, "compiling", contextlib.nullcontext)
+    monkeypatch.setattr(hil, "pack", pack)
+    monkeypatch.setattr(hil, "machine", lambda *_: contextlib.nullcontext(lines))
+    monkeypatch.setattr("sys.argv", ["hil.py", *options])
+    with monkeypatch.context() as patch:
+        patch.setattr(hil, "interrupt_on_signals", lambda: None)  # of the process of the tests
+        code = hil.main()
+    assert not image[0].exists()
+    return code
+
+
+RESULTS = {
+    "vcan.code": "0\n",
+    "vcan.log": "31 passed in 9.00s\n",
+    "price.json": '{"socket_us": {"p50": 9.0}, "ratio": 4.0}',
+}
+"""Results of the tests marked vcan."""
+
+
+def test_results_of_an_earlier_run_do_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ends_at_once(monkeypatch, "--only", "tests", "--keep", str(tmp_path / "new")) == 1
+    assert "exit code none" in capsys.readouterr().err
+    for name, content in RESULTS.items():
+        (tmp_path / name).write_text(content)
+    with pytest.raises(SystemExit) as ended:
+        ends_at_once(monkeypatch, "--only", "tests", "--keep", str(tmp_path))
+    assert ended.value.code == 2
+    assert f"{tmp_path}: the folder is not empty" in capsys.readouterr().err
+
+
+def test_every_file_with_tests_marked_vcan_is_run_in_the_machine() -> None:
+    folder = Path(__file__).parents[1]
+    marked = re.compile(r"carriers\.(on_vcan|NEEDS_VCAN)\b|import .*\bon_vcan\b")
+    files = {path for path in folder.rglob("test_*.py") if marked.search(path.read_text(encoding="utf-8"))}
+    assert {str(path.relative_to(folder.parent)) for path in files} == set(hil_machine.TESTS)
+
+
+@pytest.mark.parametrize("summary", ["", "31 skipped in 9.00s", "30 passed, 1 skipped in 9.00s"])
+def test_tests_in_the_machine_must_all_have_passed(summary: str, tmp_path: Path) -> None:
+    for name, content in (RESULTS | {"vcan.log": summary}).items():
+        (tmp_path / name).write_text(content)
+    with pytest.raises(Failed, match="the tests marked vcan"):
+        hil._judge_tests(tmp_path, hil.Progress(io.StringIO()), {"checks": {}})

@@ -43,11 +43,19 @@ def test_a_sound_log_has_no_problem_and_is_counted(tmp_path: Path) -> None:
         ("(2.0) can1 000#8003\n(2.1) can1 702#7F\n", "node 2 is operational no more but 7F"),
         ("(2.0) can1 082#8130110000000000\n", "node 2 sends EMCY 3081"),
         ("(2.0) can1 602#40\n", "malformed"),
+        ("(2.0) can1 18DAF110#0102\n", "1 of 9 frames are not CANopen"),
     ],
 )
 def test_what_is_wrong_is_told(tmp_path: Path, frames: str, problem: str) -> None:
     (found,) = problems(tmp_path, frames)
     assert problem in found
+
+
+def test_frames_that_are_not_decoded_prove_nothing(tmp_path: Path) -> None:
+    assert hil_dissector.problems([], 9.0) == ["0 of 0 frames are not CANopen, says Wireshark"]
+    (tmp_path / "bus.log").write_text(SOUND.lstrip())
+    frames = [frame._replace(function=None) for frame in hil_dissector.dissect(tmp_path / "bus.log")]
+    assert hil_dissector.problems(frames, 9.0) == ["8 of 8 frames are not CANopen, says Wireshark"]
 
 
 @pytest.mark.parametrize("command", ["8002", "8000", "0202", "8102"])
