@@ -24,11 +24,12 @@ from trirail.config import SIM, load
 from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry import journal, reading
 from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
+from trirail.telemetry.contents import read_contents
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.reading import OlderRecordingWarning, SkippedFileWarning, read, read_session
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import Scene
-from trirail.wire.messages import Event
+from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE
 
 WALL_NS = 1_795_245_300_000_000_000
@@ -298,8 +299,29 @@ def test_a_file_that_the_operating_system_refuses_is_refused_with_its_path(
 def test_a_recording_without_records_is_told_as_what_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)  # a recorder that is killed deletes nothing
     written(tmp_path / "a.rrd", made.records(0.1)[:0])
-    with pytest.raises(EmptyRecordingError, match=r"a\.rrd: the recording is empty, because the service ended before"):
+    with pytest.raises(EmptyRecordingError, match=r"a\.rrd: the recording is empty, because the service or its recorder ended"):
         read(tmp_path / "a.rrd")
+
+
+def test_events_in_a_file_without_records_belong_to_their_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a part that a recorder has begun just before it was killed: the loop does not send its events again."""
+    monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)  # a recorder that is killed deletes nothing
+    sent, wall = made.records(0.1), WALL_NS * 1e-9
+    events = [
+        Event("fault", "error", "drive B: silent", seq=seq, t=0.1, cycle=100, time=wall, fault=FaultDetail("emcy"))
+        for seq in (1, 2)
+    ]
+    written(tmp_path / "a.rrd", sent, (events[0],))
+    written(tmp_path / "b.rrd", sent[:0], (events[1],))
+    for paths in ([tmp_path / "a.rrd", tmp_path / "b.rrd"], [tmp_path / "b.rrd", tmp_path / "a.rrd"]):
+        session = read_session(paths)
+        assert made.bits(session.records) == made.bits(sent)
+        assert sorted(line.event.seq for line in session.events if line.event) == [1, 2]
+    assert [entry.message for entry in read_contents(tmp_path / "b.rrd").faults] == ["drive B: silent"]
+    with pytest.raises(EmptyRecordingError):
+        read_session([tmp_path / "b.rrd"])
 
 
 def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:

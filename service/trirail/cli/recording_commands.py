@@ -37,7 +37,7 @@ def replay(
     Parameters
     ----------
     file
-        Recording, or all files of a rotated recording. Of several files, unreadable and empty ones are left out.
+        Recording, or all files of a rotated recording. Of several files, unreadable ones are left out.
     config
         Configuration to try instead of the recorded one; the drives are then simulated.
     """
@@ -70,7 +70,7 @@ def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Fl
     Parameters
     ----------
     file
-        Recording, or all files of a rotated recording. Of several files, unreadable and empty ones are left out.
+        Recording, or all files of a rotated recording. Of several files, unreadable ones are left out.
     plot
         Picture to draw. The suffix selects the format: .png, .svg or .pdf.
     json
@@ -116,7 +116,7 @@ def export(
     Parameters
     ----------
     file
-        Recording, or all files of a rotated recording. Of several files, unreadable and empty ones are left out.
+        Recording, or all files of a rotated recording. Of several files, unreadable ones are left out.
     out
         File to write; an existing file is never overwritten. The suffix selects the format: .csv, .parquet, .npy or
         .mcap. If absent, a CSV file beside the recording.

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Meta
 from trirail_drivers import files
 
-from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
+from trirail.errors import ConfigError, ServiceError
 from trirail.naming import BLACK_BOX
 from trirail.telemetry.retention import STAMP, is_black_box, robot_in, session_of, sidecar
 from trirail.wire.decoding import INVALID, decoded, prepare
@@ -130,21 +130,20 @@ def read_contents(path: Path) -> Contents:
     If the recording cannot be read, `trouble` contains the reason. The robot is then that in the name of the file.
     """
     from trirail.telemetry import provenance  # imported late, because importing Rerun takes most of the start-up time
-    from trirail.telemetry.reading import read
+    from trirail.telemetry.reading import read_part
 
     contents = Contents(path.name, robot_in(path.name))
     try:
-        recording = read(path)
+        recording = read_part(path)
         config = provenance.configuration(recording.texts)
-    except EmptyRecordingError:
-        return contents
     except (ServiceError, ConfigError, OSError) as error:
         contents.trouble = str(error)
         return contents
     if config is not None:
         contents.robot, contents.rate_hz = config.robot.name, config.loop.rate_hz
-    began, ended = (float(wall.astype("datetime64[ns]").astype(int)) * 1e-9 for wall in recording.wall[[0, -1]])
-    contents.add_cycles(began, ended, len(recording.records))
+    if len(recording.records):
+        began, ended = (float(wall.astype("datetime64[ns]").astype(int)) * 1e-9 for wall in recording.wall[[0, -1]])
+        contents.add_cycles(began, ended, len(recording.records))
     for line in recording.events:
         if line.event is not None:
             contents.event(line.event)

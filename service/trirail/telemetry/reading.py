@@ -95,6 +95,20 @@ def read(path: str | os.PathLike[str]) -> Recording:
     OlderRecordingWarning
         The recording lacks fields that were added later. Those fields are NaN, or 0 if they are not floats.
     """
+    recording = read_part(path)
+    if not len(recording.records):
+        raise _empty(path)
+    return recording
+
+
+def _empty(path: str | os.PathLike[str]) -> EmptyRecordingError:
+    return EmptyRecordingError(
+        f"{path}: the recording is empty, because the service or its recorder ended before a cycle was recorded"
+    )
+
+
+def read_part(path: str | os.PathLike[str]) -> Recording:
+    """Read one file of a session, which may hold events and inputs without records. Otherwise the same as `read`."""
     path = Path(path)
     size = _size(path)
     try:
@@ -108,10 +122,9 @@ def read(path: str | os.PathLike[str]) -> Recording:
     texts = _static(chunks, _DOCUMENT)
     kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
     if SOFTWARE in texts and not kept:
-        raise EmptyRecordingError(
-            f"{path}: the recording is empty, because the service ended before the first cycle was recorded"
-        )
-    records, t, wall = _cycles([chunk.to_record_batch() for chunk in kept], path)
+        records, t, wall = np.zeros(0, DTYPE), np.zeros(0), np.zeros(0, "datetime64[ns]")
+    else:
+        records, t, wall = _cycles([chunk.to_record_batch() for chunk in kept], path)
     return Recording(
         name=next(iter(_static(chunks, "RecordingInfo:name").values()), ""),
         records=records,
@@ -126,12 +139,14 @@ def read(path: str | os.PathLike[str]) -> Recording:
 def read_session(paths: Sequence[str | os.PathLike[str]]) -> Recording:
     """Read and join the files of a session, given in any order.
 
-    If there are several files, a file that cannot be read or is empty is left out. A power cut can leave such a file.
+    If there are several files, a file that cannot be read is left out. A power cut can leave such a file.
 
     Raises
     ------
     ServiceError
         No file can be read, or the recordings belong to different sessions.
+    EmptyRecordingError
+        The files hold no records.
 
     Warns
     -----
@@ -142,14 +157,17 @@ def read_session(paths: Sequence[str | os.PathLike[str]]) -> Recording:
     errors: list[ServiceError] = []
     for path in paths:
         try:
-            parts.append(read(path))
+            parts.append(read_part(path))
         except ServiceError as error:
             errors.append(error)
     if not parts:
         raise errors[0]
     for each in errors:
         warnings.warn(f"{each}; this file is left out", SkippedFileWarning, stacklevel=2)
-    return join(parts)
+    session = join(parts)
+    if not len(session.records):
+        raise _empty(paths[0])
+    return session
 
 
 def join(parts: Sequence[Recording]) -> Recording:
@@ -157,7 +175,7 @@ def join(parts: Sequence[Recording]) -> Recording:
 
     Raises ServiceError if the recordings belong to different sessions.
     """
-    first, *others = sorted(parts, key=lambda part: int(part.records["cycle"][0]))
+    first, *others = parts
     for other in others:
         if (other.name, other.texts) != (first.name, first.texts):
             raise ServiceError(
@@ -336,7 +354,7 @@ def _check_layout(kind: pa.StructType, path: Path) -> None:
             f"{path}: written by an older version: its records have no {', '.join(missing)}; read as NaN, or 0 where "
             "the field is not a float",
             OlderRecordingWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
