@@ -201,6 +201,8 @@ def test_a_disk_that_is_slow_at_the_start_changes_no_times(tmp_path: Path, monke
         (["--robot", "two"], ["two"]),
         (["--since", "2026-02-01"], ["two"]),
         (["--until", "2026-02-01"], ["one"]),
+        (["--since", "2026-01-31", "--until", "2026-01-31"], ["one"]),
+        (["--until", "2026-01-31T00:00"], []),
         (["--since", "2026-03-01"], []),
         (["--fault", "EMCY"], ["one", "two"]),
         (["--fault", "0x8700"], ["one", "two"]),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import sys
-import time
 from collections.abc import Sequence
-from datetime import datetime
+from datetime import date, datetime, time
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
@@ -38,8 +39,17 @@ def _moment(_: Any, tokens: Sequence[Token]) -> datetime:
     return moment
 
 
+def _last_moment(kind: Any, tokens: Sequence[Token]) -> datetime:
+    moment = _moment(kind, tokens)
+    with contextlib.suppress(ValueError):  # not a day but a time
+        return datetime.combine(date.fromisoformat(tokens[0].value), time.max)
+    return moment
+
+
 Moment = Annotated[datetime, Parameter(converter=_moment, n_tokens=1)]
-"""A day, or a time on a day, in local time."""
+"""The beginning of a day, or a time on a day, in local time."""
+LastMoment = Annotated[datetime, Parameter(converter=_last_moment, n_tokens=1)]
+"""The end of a day, or a time on a day, in local time."""
 
 
 def sessions(
@@ -48,7 +58,7 @@ def sessions(
     *,
     robot: Annotated[str | None, Parameter(env_var="TRIRAIL_ROBOT")] = None,
     since: Moment | None = None,
-    until: Moment | None = None,
+    until: LastMoment | None = None,
     fault: Annotated[str | None, Parameter(validator=lambda _kind, words: _check_code(words))] = None,
     user: str | None = None,
     outcome: Outcome | None = None,
@@ -71,7 +81,7 @@ def sessions(
     since
         Only sessions that ended at this time or later: 2026-01-31 or 2026-01-31T12:00:00, local time.
     until
-        Only sessions that began at this time or earlier.
+        Only sessions that began at this time, on this day, or earlier.
     fault
         Only sessions with a fault whose cause, code or message contains this text: emcy, 0x8700, "drive A".
     user
@@ -121,13 +131,13 @@ class _ReadingReport:
     """Progress report that prints the recording being read if reading takes long."""
 
     def __init__(self) -> None:
-        self._due = time.monotonic() + REPORT_INTERVAL_S
+        self._due = monotonic() + REPORT_INTERVAL_S
         self._count = 0
 
     def __call__(self, path: Path) -> None:
         self._count += 1
-        if time.monotonic() >= self._due:
-            self._due = time.monotonic() + REPORT_INTERVAL_S
+        if monotonic() >= self._due:
+            self._due = monotonic() + REPORT_INTERVAL_S
             print(f"reading {path.name}, recording {self._count} without a usable .json", file=sys.stderr)  # noqa: T201
 
 
