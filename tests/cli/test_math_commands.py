@@ -237,6 +237,13 @@ def test_a_plot_that_cannot_be_written(tmp_path: Path) -> None:
         call(f"workspace --phi 0 --plot {tmp_path / 'nowhere' / 'a.png'}")
 
 
+@pytest.mark.parametrize("name", ["a", "a.", ".png"])
+def test_a_plot_is_written_to_the_named_file_or_not_at_all(name: str, tmp_path: Path) -> None:
+    with pytest.raises(TrirailError, match=r"the name must end in \.png, \.svg or \.pdf$"):
+        call(f"workspace --phi 0 --plot {tmp_path / name}")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_without_matplotlib_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delitem(sys.modules, "trirail.workspace.plots", raising=False)
     monkeypatch.delattr("trirail.workspace.plots", raising=False)

@@ -141,7 +141,12 @@ def print_table(rows: Table) -> None:
 
 @contextlib.contextmanager
 def drawing(file: Path) -> Iterator[None]:
-    """Convert errors that occur while a picture is drawn to a file into a TrirailError with the reason."""
+    """Convert errors that occur while a picture is drawn to a file into a TrirailError with the reason.
+
+    Matplotlib would add .png to a name without a suffix, and write that file instead.
+    """
+    if not file.suffix:
+        raise TrirailError(f"cannot draw to {file}: the name must end in .png, .svg or .pdf")
     try:
         yield
     except ImportError as error:
