@@ -210,6 +210,12 @@ def test_a_file_that_exists_is_not_recorded_to(name: str, tmp_path: Path) -> Non
     assert path.read_bytes() == content
 
 
+def test_a_recording_is_not_written_to_its_own_log_of_frames(tmp_path: Path) -> None:
+    with pytest.raises(ServiceError, match=r"name the recording session\.rrd$"):
+        recorder(tmp_path, configured(capture_can=True), path=tmp_path / "session.log")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_live_port_in_use_is_refused(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -451,8 +451,10 @@ def _create(path: Path, *, log: bool) -> Path:
     """Create an empty file and, if `log`, one for the log of CAN frames; empty files are used as they are.
 
     Raises FileError if a file is not a regular file (opening a FIFO would wait for a reader), and ServiceError if a
-    recorder is writing the file, or if it is not empty.
+    recorder is writing the file, if it is not empty, or if it would also be the log.
     """
+    if log and path.suffix == ".log":
+        raise ServiceError(f"{path} would also be the log of CAN frames; name the recording {path.stem}.rrd")
     path.parent.mkdir(parents=True, exist_ok=True)
     for each in (path.with_suffix(".log"), path) if log else (path,):
         with contextlib.suppress(FileNotFoundError):
