@@ -215,17 +215,19 @@ def file_left_open(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
-    text, empty, cut, header = (tmp_path / f"{name}.rrd" for name in ("text", "empty", "cut", "header"))
+    text, empty, nul, cut, header = (tmp_path / f"{name}.rrd" for name in ("text", "empty", "nul", "cut", "header"))
     header.write_bytes(b"RRF2\0\x20\0\0\1\0\0")
     text.write_text("t,x,y\n")
     empty.write_bytes(b"")
+    nul.write_bytes(bytes(1000))
     written(tmp_path / "whole.rrd", made.records(0.1))
     cut.write_bytes((tmp_path / "whole.rrd").read_bytes()[:1000])
     for path, why in {
         tmp_path / "absent.rrd": "No such file or directory",
         tmp_path: "a folder; expected a regular file",
         text: "not a recording: an RRD file begins with RRF2",
-        empty: "not a recording: an RRD file begins with RRF2",
+        empty: "cut off in its header: the recording is empty",
+        nul: "cut off in its header: the recording is empty",
         cut: "contains no",
         header: "cut off in its header",
     }.items():

@@ -245,9 +245,10 @@ def _complete_length(path: Path) -> int:
     the data. A message that extends into these bytes is not complete.
     """
     with files.open_regular(path) as file:
-        if file.read(len(MAGIC)) != MAGIC:
+        begin = file.read(len(MAGIC))
+        if begin.strip(b"\0") and begin != MAGIC:
             raise ServiceError(f"{path}: not a recording: an RRD file begins with {MAGIC.decode()}")
-        if os.fstat(file.fileno()).st_size < _FILE_HEADER:
+        if begin != MAGIC or os.fstat(file.fileno()).st_size < _FILE_HEADER:
             raise ServiceError(f"{path}: cut off in its header: the recording is empty")
         size, end = os.fstat(file.fileno()).st_size, _FILE_HEADER
         filled = min(size, _filled_length(file, size) + _LAST_NULS)
