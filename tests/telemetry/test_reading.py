@@ -301,7 +301,9 @@ def test_a_file_that_the_operating_system_refuses_is_refused_with_its_path(
 def test_a_recording_without_records_is_told_as_what_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)  # a recorder that is killed deletes nothing
     written(tmp_path / "a.rrd", made.records(0.1)[:0])
-    with pytest.raises(EmptyRecordingError, match=r"a\.rrd: the recording is empty, because the service or its recorder ended"):
+    with pytest.raises(
+        EmptyRecordingError, match=r"a\.rrd: the recording is empty, because the service or its recorder ended"
+    ):
         read(tmp_path / "a.rrd")
 
 
