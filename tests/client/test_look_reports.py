@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.alignment.images import Pair
 from trirail.alignment.procedure import Alignment, AlignmentTask, StageMotion, align, calibrate_by_moves, measure_part
-from trirail.client.alignment import UnrecordedAlignmentWarning, drive, drive_async, goals
+from trirail.client.alignment import UnrecordedAlignmentWarning, drive, drive_async, finish, goals
 from trirail.errors import AlignmentError, RefusalCode, RefusedError, ServiceError, WaitTimeoutError
 from trirail.wire import boundary
 from trirail.wire.looks import AlignmentLook
@@ -44,8 +44,10 @@ class Told:
     def state(self) -> Any:
         mode, override, progress = self._shown
         goal = None if progress is None else SimpleNamespace(id=self._goal, progress=progress)
-        sliders = SimpleNamespace(position=(0.0, 0.0, 0.0))
-        return SimpleNamespace(pose=self.stage.pose, sliders=sliders, mode=mode, override=override, goal=goal)
+        sliders, commanded = SimpleNamespace(position=(0.0, 0.0, 0.0)), SimpleNamespace(pose=self.stage.pose)
+        return SimpleNamespace(
+            pose=self.stage.pose, commanded=commanded, sliders=sliders, mode=mode, override=override, goal=goal
+        )
 
     def send(self, goal: Any) -> Any:
         motion = (goal.x, goal.y, goal.phi)
@@ -118,6 +120,42 @@ def test_a_motion_that_makes_no_progress_without_a_pause_ends_it_and_stops(
         told.drive(calibrate_by_moves())
     assert told.stops == 1
     assert told.looks[-1].end == "failed"
+
+
+@given(st.integers(1, 7), st.sampled_from(["look", "wait", "report"]))
+def test_another_motion_at_any_look_ends_it_and_is_not_stopped(number: int, place: str) -> None:
+    class Shared(Told):
+        def park(self, at: str) -> None:
+            if at == place and self.stage.motions == number - (place != "wait"):
+                self.stage.go(StageMotion((0.02, 0.0, 0.0)))
+                self.parked = self.stage.motions
+
+        def _report_look(self, message: bytes) -> None:
+            super()._report_look(message)
+            self.park("report")
+
+    told = Shared(1)
+
+    def look() -> Any:
+        told.park("look")
+        return told.stage.look()
+
+    with pytest.raises(RefusedError, match=r"another motion has moved the robot .* by x (19|20|21) mm, "):
+        finish(drive_async(told, look, calibrate_by_moves(), 1.0, 0.0, lambda _: told.park("wait")))
+    assert (told.stage.motions, told.stops) == (told.parked, 0)
+    assert [look.end for look in told.looks[-1:]] in ([], ["failed"])
+
+
+def test_the_pose_of_a_disabled_robot_may_change_between_looks() -> None:
+    told = Told(1)
+    wanted = task(told, (1e-4, -2e-4, 1e-3))._replace(looks=4)
+    told._shown = ("disabled", 1.0, None)
+
+    def look() -> Any:
+        told.stage.go(StageMotion((1e-8 * told.stage.motions, 0.0, 0.0)))
+        return told.stage.look()
+
+    assert told.drive(measure_part(wanted), look).worst > 1e-4
 
 
 def task(told: Told, error: Triple) -> AlignmentTask:

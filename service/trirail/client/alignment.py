@@ -27,6 +27,7 @@ from trirail.alignment.results import Measurement
 from trirail.client.call_time import called, called_at
 from trirail.client.goal import Result
 from trirail.errors import RefusalCode, RefusedError, TrirailError, WaitTimeoutError
+from trirail.quantities import worded
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal
 from trirail.wire.looks import AlignmentLook, LookEnd, LookError, SeenMark
 from trirail.wire.state import State
@@ -41,6 +42,8 @@ A coroutine function is allowed with AsyncRobot only."""
 EMPTY_OBSERVATION = Observation({}, (0.0, 0.0, 0.0), 0.0)
 PROGRESS_WITHIN = 60.0
 """Time in which a motion must make progress, unless it is paused or the override is 0 [s]."""
+SAME_POSE = 1e-9
+"""Greatest difference of two commanded poses of a robot that holds its position [m, rad]."""
 ENDS_AT_TARGET = ("done", "unsettled")
 """Outcomes of a goal that leave the robot at or near its target. The next look measures the remaining distance."""
 
@@ -124,7 +127,7 @@ async def drive_async(
     Raises
     ------
     RefusedError
-        If a motion is refused or does not reach its target.
+        If a motion is refused or does not reach its target, or if another motion moves the robot meanwhile.
     Exception
         If `look` raises it.
 
@@ -136,19 +139,22 @@ async def drive_async(
     ids = reports.goal_ids()
     try:
         await completed(robot._begin_call(began))
+        rest = _rest(await completed(robot.state()))
         request = next(requests)
         while True:
             if isinstance(request, LookReport):
                 await _report(robot, reports, reports.message(request))
             else:
                 if isinstance(request, StageMotion):
+                    _check_rest(rest, await completed(robot.state()))
                     for goal in goals(request, speed):
                         await _move(robot, goal, next(ids), began)
+                    rest = _rest(await completed(robot.state()))
                     await completed(sleep(wait))
                     marks = sight.marks
                 else:
                     marks = await _marks_from(look)
-                state = await completed(robot.state())
+                _check_rest(rest, state := await completed(robot.state()))
                 sight = Observation(marks, state.pose, time.monotonic(), state.sliders.position)
             request = requests.send(sight)
     except StopIteration as end:
@@ -156,6 +162,23 @@ async def drive_async(
     except BaseException as error:
         await _report(robot, reports, reports.failure(error))
         raise
+
+
+def _rest(state: State) -> Triple | None:
+    """Return the commanded pose, which changes only with a motion; None if it follows the measured pose."""
+    return state.commanded.pose if state.mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) else None
+
+
+def _check_rest(rest: Triple | None, state: State) -> None:
+    """Raise RefusedError if the commanded pose is no longer `rest`: the next motion would surprise another user."""
+    now = state.commanded.pose
+    if rest is not None and max(abs(a - b) for a, b in zip(rest, now, strict=True)) > SAME_POSE:
+        x, y, phi = (each - before for each, before in zip(now, rest, strict=True))
+        raise RefusedError(
+            RefusalCode.FAILED,
+            f"another motion has moved the robot since the alignment's last one, by x {worded(x, 'm')}, "
+            f"y {worded(y, 'm')}, phi {worded(phi, 'rad')}: begin again when no other user moves the robot",
+        )
 
 
 async def _marks_from(look: Look) -> Marks:
