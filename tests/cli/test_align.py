@@ -16,14 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 import warm
+from client.test_look_reports import Told
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from trirail.alignment.calibration_procedure import calibrate_by_moves
 from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.cli import align_command, mark_source
+from trirail.cli.alignment_targets import observe_targets
 from trirail.cli.app import app
 from trirail.cli.mark_source import MarkSource
 from trirail.client import calibration_file
@@ -465,6 +468,28 @@ def test_a_damaged_calibration_may_be_replaced(content: str, tmp_path: Path) -> 
     file = tmp_path / "camera.json"
     file.write_text(content, encoding="utf-8")
     calibration_file.check_replaceable(file)
+
+
+@given(st.sets(st.sampled_from(["left", "right"])), st.booleans())
+def test_targets_are_those_of_the_calibrated_marks_whatever_the_last_look_shows(seen: set[str], another: bool) -> None:
+    """An alignment refuses a target of a mark that is not calibrated, and cannot use a mark without a target."""
+    robot = Told(7)
+    calibration = robot.drive(calibrate_by_moves())
+    computed = robot.stage.look()
+
+    def look() -> dict[str, Pair]:
+        marks = {name: pixel for name, pixel in robot.stage.look().items() if name in seen}
+        return marks | ({"another": (5.0, 6.0)} if another else {})
+
+    targets, failures = observe_targets(robot, look, MarkSource(), calibration)  # type: ignore[arg-type]
+    assert targets.keys() == calibration.marks.keys()
+    assert [pixel for name in targets for pixel in targets[name]] == pytest.approx(
+        [pixel for name in targets for pixel in computed[name]], abs=1.0
+    )
+    unseen = [name for name in ("left", "right") if name not in seen]
+    assert [str(each) for each in failures] == [
+        f"marks not found after the last move: {', '.join(unseen)}; their targets are their computed positions"
+    ] * bool(unseen)
 
 
 def test_the_limit_of_a_correction_with_another_geometry_is_told_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,8 +17,8 @@ def observe_targets(
 ) -> tuple[Marks, list[TrirailError]]:
     """Return the pixels of the marks in a new look, at the pose of the calibration's first look, and a list of errors.
 
-    A calibration takes long, so it must not be lost if this look fails. The pixels are then those that the calibration
-    computes, and the list contains the error.
+    A calibration takes long, so it must not be lost if this look fails, and its targets must fit its marks. The pixels
+    of marks that are not found are those that the calibration computes, and the list contains the error.
     """
     import numpy as np
 
@@ -27,13 +27,17 @@ def observe_targets(
     from trirail.alignment.procedure import observe_mean
     from trirail.client.alignment import drive
 
+    targets = {}
+    for name, mark in calibration.marks.items():
+        at = np.array([to_base_frame(mark.place, calibration.poses[0])])
+        u, v = project_points(calibration.views[mark.view], at)[0].tolist()
+        targets[name] = (u, v)
     try:
-        return dict(drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks), []
+        marks = drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks
     except (TrirailError, OSError) as error:
-        targets = {}
-        for name, mark in calibration.marks.items():
-            at = np.array([to_base_frame(mark.place, calibration.poses[0])])
-            u, v = project_points(calibration.views[mark.view], at)[0].tolist()
-            targets[name] = (u, v)
         words = f"the look after the last move has failed: {error}; the targets are the computed positions of the marks"
         return targets, [TrirailError(words)]
+    unseen = ", ".join(name for name in targets if name not in marks)
+    targets |= {name: pixel for name, pixel in marks.items() if name in targets}
+    words = f"marks not found after the last move: {unseen}; their targets are their computed positions"
+    return targets, [TrirailError(words)] if unseen else []
