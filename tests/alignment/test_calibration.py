@@ -211,6 +211,16 @@ def test_a_first_look_without_a_mark_is_refused_and_nothing_moves() -> None:
     assert stage.motions == 0
 
 
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_view_without_its_centre_is_refused_and_nothing_moves(lens: Lens) -> None:
+    stage = two_cameras(4, lens)
+    centre = {"left": (1000.0, 800.0), "rigth": (1000.0, 800.0)}
+    with pytest.raises(AlignmentError, match="views without a centre: right;") as refused:
+        stage.drive(calibrate_by_moves(calibration_moves(lens, 1e-3, 0.0175), lens=lens, centre=centre))
+    assert refused.value.fault is AlignmentFault.MISSING
+    assert stage.motions == 0
+
+
 def test_a_lens_that_so_few_looks_cannot_tell_is_refused() -> None:
     with pytest.raises(AlignmentError) as refused:
         two_cameras(5, "perspective").drive(calibrate_by_moves(DEFAULT_MOVES[:4], lens="perspective"))

@@ -73,7 +73,7 @@ def calibrate_by_moves(
     yield LookReport("calibration", first)
     poses = [_add(first.pose, move) for move in moves]
     try:
-        _check_first(first, poses, views, lens)
+        _check_first(first, poses, views, lens, centre)
     except AlignmentError as error:
         yield LookReport("calibration", end=error.fault, words=str(error))
         raise
@@ -92,8 +92,14 @@ def calibrate_by_moves(
     return calibration
 
 
-def _check_first(first: Observation, poses: Sequence[Triple], views: Mapping[str, str] | None, lens: Lens) -> None:
-    """Check before any move that the first look shows marks with a view, and that the moves determine the maps.
+def _check_first(
+    first: Observation,
+    poses: Sequence[Triple],
+    views: Mapping[str, str] | None,
+    lens: Lens,
+    centre: Pair | Mapping[str, Pair] | None,
+) -> None:
+    """Check before any move that the first look shows marks, and that the moves determine the maps of their views.
 
     Raises AlignmentError.
     """
@@ -104,7 +110,7 @@ def _check_first(first: Observation, poses: Sequence[Triple], views: Mapping[str
     if views is not None and (unknown := sorted(set(first.marks) - set(views))):
         text = f"marks without a view: {', '.join(unknown)}; give each mark a view; views has {', '.join(views)}"
         raise AlignmentError(AlignmentFault.MISSING, text)
-    check_moves([first.pose, *poses], sorted(first.marks), views, lens)
+    check_moves([first.pose, *poses], sorted(first.marks), views, lens, centre)
 
 
 def repeat_calibration(

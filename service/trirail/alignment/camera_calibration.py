@@ -236,6 +236,10 @@ def fit_cameras(
         raise AlignmentError(
             AlignmentFault.MISSING, f"marks without a view: {', '.join(unknown)}; give each mark a view"
         )
+    if isinstance(centre, Mapping) and (without := sorted({view_of[name] for name in names} - set(centre))):
+        raise AlignmentError(
+            AlignmentFault.MISSING, f"views without a centre: {', '.join(without)}; give each view its centre"
+        )
     if len(names) < 1:
         raise AlignmentError(AlignmentFault.MISSING, "no mark was found in any look; check light, focus and threshold")
     fits = {
@@ -288,7 +292,13 @@ def fit_cameras(
     return calibration
 
 
-def check_moves(poses: Sequence[Triple], marks: Sequence[str], views: Mapping[str, str] | None, lens: Lens) -> None:
+def check_moves(
+    poses: Sequence[Triple],
+    marks: Sequence[str],
+    views: Mapping[str, str] | None,
+    lens: Lens,
+    centre: Pair | Mapping[str, Pair] | None = None,
+) -> None:
     """Check that looks at poses [m, rad] determine the maps, if every look shows all marks without noise.
 
     Raises AlignmentError if they do not.
@@ -301,7 +311,7 @@ def check_moves(poses: Sequence[Triple], marks: Sequence[str], views: Mapping[st
     samples = [
         CalibrationSample(pose, dict.fromkeys(marks, _pair(pixel))) for pose, pixel in zip(poses, pixels, strict=True)
     ]
-    fit_cameras(samples, views, lens)
+    fit_cameras(samples, views, lens, centre)
 
 
 def separate_noises(common: CameraCalibration) -> CameraCalibration:
