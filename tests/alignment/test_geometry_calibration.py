@@ -530,6 +530,19 @@ def test_a_check_after_an_error_of_homing_stays_within_the_limits(seed: int, hom
         poses_within(outside, found.geometry, found.cameras)
 
 
+@given(SEEDS, st.booleans())
+@settings(deadline=None, max_examples=20)
+def test_two_names_of_one_mark_are_refused_after_the_first_moves(seed: int, one: bool) -> None:
+    made, task = stage("uvw", seed, 0.05)
+    look = made.look
+    made.look = lambda: (seen := look()) | ({"again": seen["left"]} if "left" in seen else {})  # type: ignore[method-assign]
+    views = {"left": "a", "again": "a" if one else "b", "right": "c"}
+    with pytest.raises(AlignmentError, match=r"marks (left and again|again and left) are at the same") as refused:
+        made.drive(calibrate_geometry(task._replace(views=views)))
+    assert refused.value.fault is AlignmentFault.MISSING
+    assert made.motions == 6
+
+
 def test_marks_that_do_not_move_and_a_field_without_marks_are_refused() -> None:
     made, task = stage("uvw", 1)
     pose: Triple = (0.0, 0.0, 0.0)

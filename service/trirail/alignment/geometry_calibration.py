@@ -29,6 +29,7 @@ from trirail.alignment.camera_calibration import (
 )
 from trirail.alignment.fresh_pictures import average, capture
 from trirail.alignment.images import Lens, Pair
+from trirail.alignment.misalignment import SAME_PLACE_M
 from trirail.alignment.pose_plan import choose_poses, find_candidates
 from trirail.alignment.residual_map import ResidualMap, fit_residual_map
 from trirail.alignment.rigid_motion import Floats
@@ -276,6 +277,12 @@ def start_model(task: GeometryTask, looks: Sequence[StageLook]) -> tuple[StageMo
             AlignmentFault.MISSING, f"marks without a view: {', '.join(unknown)}; give each mark a view"
         )
     cameras = _first_calibration([CalibrationSample(look.pose, look.marks) for look in looks], views)
+    for (one, mark), (other, beside) in itertools.combinations(cameras.marks.items(), 2):
+        if math.dist(mark.place, beside.place) < SAME_PLACE_M:
+            raise AlignmentError(
+                AlignmentFault.MISSING,
+                f"marks {one} and {other} are at the same place; check that each name has its own mark",
+            )
     middle = (task.field[0] / 2.0, task.field[1] / 2.0)
     started = {
         name: structs.replace(view, lens=task.lens, bend=(0.0, 0.0), centre=middle)
