@@ -238,6 +238,18 @@ def test_legs_far_from_their_configuration_leave_no_more_than_the_noise_of_the_p
     assert misses(made, found, unseen(task, 40)).max() < 0.2
 
 
+@pytest.mark.parametrize("part", [PART, {"left": (-0.06, 0.0), "right": (-0.054, 0.0)}])
+@pytest.mark.generated(0, 1, 2, 3, 4, 5, 6, 7)
+def test_few_looks_at_a_stage_far_from_its_drawings_leave_no_more_than_the_noise(
+    seed: int, part: Mapping[str, Pair]
+) -> None:
+    """A noise that is too high would keep configured values that the looks contradict."""
+    made, task = stage(sorted(STAGES)[seed % 3], seed, noise=0.05, part=part)
+    made.built = built_otherwise(task.start, np.random.default_rng(seed), 1e-3, 2e-3)
+    found = made.drive(calibrate_geometry(task._replace(poses=14, looks=2)))
+    assert found.noise < 1.7 * 0.05 / math.sqrt(2.0)
+
+
 def test_a_fit_that_does_not_converge_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage_fit, "MAX_ROUNDS", 2)
     made, task = stage("uvw", 1, noise=0.05)

@@ -1,8 +1,9 @@
 """Robust fit of a stage model to looks. Outliers are excluded, and undetermined combinations keep configured values.
 
 The noise is estimated from the median of the residuals. A first fit with a robust loss function (soft l1; Triggs et al.
-2000, Bundle Adjustment, 4.3) finds the outliers. The last fit is a least-squares fit without the outliers. In both
-fits, the drawings are treated as an additional observation of each correction, with the standard deviations
+2000, Bundle Adjustment, 4.3) finds the outliers. Least-squares fits without the outliers follow until the noise no
+longer falls: first of all combinations, then of those that the looks determine. With a noise that is still too high,
+some of these would appear undetermined. In all fits, the drawings are treated as an additional observation of each correction, with the standard deviations
 StageModel.doubts. If the corrections are greater on average, these standard deviations are increased to their root mean
 square: a stage that was homed 1 mm off would otherwise be held back, and would look as if no geometry explained it.
 In the same way, the middle of the picture is an additional observation of the centre of a radial lens, which looks do
@@ -29,8 +30,8 @@ MAX_OUTLIER_SHARE, MAX_MARK_OUTLIER_SHARE = 0.3, 0.5
 """Greatest fraction of outliers among all observations, and among those of one mark."""
 TOLERANCE = 1e-12
 MAX_EVALUATIONS = 100
-MAX_ROUNDS = 30
-MIN_NOISE_SHARE = 0.9
+MAX_ROUNDS = 40
+MIN_NOISE_SHARE = 0.97
 """Fraction of the noise in the round before, below which the noise still falls. The fit is then not finished: a lower
 noise gives the looks a greater weight against the drawings."""
 RAYLEIGH_MEDIAN = 1.1774
@@ -77,12 +78,12 @@ def fit_stage(
         unknowns = _minimise(model, looks, unknowns, used, free, noise, 1.0, robust=False)
         return _result(model, looks, unknowns, used, free, 1.0)
     unknowns = _minimise(model, looks, unknowns, used, np.eye(model.size), 1.0, 1.0, robust=True)
-    noise, free = math.inf, model.size
+    noise, basis, is_reduced = math.inf, np.eye(model.size), False
     for _ in range(MAX_ROUNDS):
         away = np.linalg.norm(model.residuals(unknowns, looks), axis=1)
         # The fit brings the computed pixels nearer to the observed ones: few looks leave less than the noise.
         count = 2 * int(used.sum())
-        share = math.sqrt(count / max(count - free, 1))
+        share = math.sqrt(count / max(count - basis.shape[1], 1))
         last, noise = noise, max(share * float(np.median(away[used])) / RAYLEIGH_MEDIAN, MIN_NOISE_PX)
         now = away <= OUTLIER_DEVIATIONS * noise
         if now.mean() < 1.0 - MAX_OUTLIER_SHARE:
@@ -100,14 +101,16 @@ def fit_stage(
                     f"{len(own)} looks; check that its camera takes a new picture at each look, and its name",
                 )
         doubt = max(1.0, float(np.sqrt(np.mean(unknowns[: model.legs] ** 2))))
-        basis = _determined(model, model.jacobian(unknowns, looks)[now] / noise * doubt)
-        free = basis.shape[1]
-        unknowns[: model.legs] = basis[: model.legs] @ (basis[: model.legs].T @ unknowns[: model.legs])
+        if is_reduced:
+            jacobian = model.jacobian(unknowns, looks)[now]
+            basis = _determined(model, jacobian / noise * doubt)
+            unknowns = _with_configured_combinations(model, unknowns, basis, jacobian)
         is_falling, is_same = noise < MIN_NOISE_SHARE * last, np.array_equal(now, used)
         used = now
         unknowns = _minimise(model, looks, unknowns, used, basis, noise, doubt, robust=False)
-        if is_same and not is_falling:
+        if is_reduced and is_same and not is_falling:
             break
+        is_reduced = is_reduced or not is_falling
     if is_falling:
         raise AlignmentError(
             AlignmentFault.MOVES,
@@ -166,6 +169,20 @@ def _determined(model: StageModel, jacobian: Floats) -> Floats:
     basis[: model.legs, : known.shape[1]] = known
     basis[model.legs :, known.shape[1] :] = np.eye(model.size - model.legs)
     return basis
+
+
+def _with_configured_combinations(model: StageModel, unknowns: Floats, basis: Floats, jacobian: Floats) -> Floats:
+    """Return the unknowns with the configured values of all combinations of legs that are not in `basis`.
+
+    Cameras and marks change with them, so that the computed pixels change as little as possible. `jacobian` contains
+    the derivatives of the pixels, (n, 2, size).
+    """
+    known = basis[: model.legs]
+    change = known @ (known.T @ unknowns[: model.legs]) - unknowns[: model.legs]
+    rows = jacobian.reshape(-1, model.size)
+    scales = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)[model.legs :]
+    others = np.linalg.lstsq(rows[:, model.legs :] / scales, -rows[:, : model.legs] @ change, rcond=None)[0] / scales
+    return unknowns + np.concatenate([change, others])
 
 
 def _minimise(
