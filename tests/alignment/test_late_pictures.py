@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from decimal import Decimal
 
 import msgspec
 import numpy as np
@@ -166,7 +167,7 @@ def test_marks_too_near_to_tell_the_angle_are_not_called_right(seed: int) -> Non
 
 
 BAD_TASKS = {
-    "looks": (0, -1, 1.5, "2", None, math.nan, True),
+    "looks": (0, -1, 1.5, "2", None, math.nan, True, Decimal("2"), np.float32(2.0)),
     "tolerance": (-1, 0.0, math.nan, "1um", None, [1.0]),
     "angle": (-1e-5, math.nan, "5arcsec", None),
     "distance": (-1.0, math.nan, None),
@@ -186,7 +187,7 @@ BAD_TASKS = {
 BAD_CALIBRATIONS = {
     "moves": (3, "abc", [(1e-3, 0.0)], [(math.nan, 0.0, 0.0)], [None], *((m, "x") for m in DEFAULT_MOVES[:1])),
     "views": ([1], {"left": 3}, {"left": "one"}),
-    "lens": ("fisheye", None, 3),
+    "lens": ("fisheye", None, 3, [], np.zeros(2)),
     "centre": ((1.0,), (math.nan, 0.0)),
     "looks": BAD_TASKS["looks"],
     "approach": BAD_TASKS["approach"],

@@ -384,6 +384,11 @@ def pages(documents: Documents, part: str = "data") -> dict[str, list[Any]]:
     return found
 
 
+def test_a_fly_scan_without_points_is_refused(connected: Stage) -> None:
+    with pytest.raises(RefusedError, match="points: the list is empty; expected"):
+        connected.follow([])
+
+
 def test_a_fly_scan_collects_every_state_on_the_way(stage: Stage, engine: Any) -> None:
     points = [(0.0, 0.01, 0.0, 0.0), (1.0, 0.02, 0.01, 0.05), (2.0, 0.03, 0.0, 0.0)]
     found = pages(run(engine, bp.fly([stage.follow(points)])))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
@@ -250,6 +251,16 @@ def test_a_service_that_takes_nothing_is_warned_of_once_and_the_result_is_the_sa
         assert told.drive(align(wanted)).reached
     assert len(warned) == 1
     assert told.looks == []
+
+
+@pytest.mark.parametrize("what", ["speed", "wait"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0, "fast", None, 1e300])
+def test_an_impossible_speed_or_wait_is_refused_in_one_line_before_the_first_look(what: str, value: Any) -> None:
+    told = Told(7)
+    with pytest.raises(RefusedError, match=f"^{what} is .*: expected a (number|fraction) .* to [0-9]+$"):
+        drive(told, told.stage.look, calibrate_by_moves(), **{"speed": 1.0, "wait": 0.0, what: value})
+    assert not told.begun
+    assert not told.stage.motions
 
 
 ODD: dict[str, Callable[[], dict[Any, Pair]]] = {

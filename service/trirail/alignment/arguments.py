@@ -8,9 +8,13 @@ from typing import NoReturn
 
 from trirail.alignment.images import LENSES, Pair
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.goal_kind import MIN_SPEED
+from trirail.wire.text import quoted
 
 MAX_PIXEL = 1e7
 """Greatest pixel coordinate that is accepted. No picture is that large, and fits with much greater ones overflow."""
+MAX_WAIT_S = 3600.0
+"""Longest waiting time after a motion that is accepted [s]."""
 
 
 def parse_pixel(value: object) -> Pair | None:
@@ -30,8 +34,7 @@ def parse_numbers(value: object, count: int) -> tuple[float, ...] | None:
 
 def check_count(value: object, name: str, minimum: int) -> None:
     """Raise RefusedError unless `value` is an integer of at least `minimum`."""
-    number = None if isinstance(value, float) else _parse_number(value)
-    if number is None or number < minimum:
+    if isinstance(value, bool) or not hasattr(type(value), "__index__") or value < minimum:  # type: ignore[operator]
         _refuse(value, name, f"a whole number of at least {minimum}")
 
 
@@ -43,10 +46,17 @@ def check_above_zero(value: object, name: str) -> None:
 
 
 def check_wait(value: object) -> None:
-    """Raise RefusedError unless `value` is a finite waiting time of 0 s or more."""
+    """Raise RefusedError unless `value` is a waiting time from 0 s to MAX_WAIT_S."""
     number = _parse_number(value)
-    if number is None or not 0.0 <= number < math.inf:
-        _refuse(value, "wait", "a finite number of seconds, 0 or more")
+    if number is None or not 0.0 <= number <= MAX_WAIT_S:
+        _refuse(value, "wait", f"a number of seconds from 0 to {MAX_WAIT_S:g}")
+
+
+def check_speed(value: object) -> None:
+    """Raise RefusedError unless `value` is a fraction of full speed from MIN_SPEED to 1."""
+    number = _parse_number(value)
+    if number is None or not MIN_SPEED <= number <= 1.0:
+        _refuse(value, "speed", f"a fraction of full speed from {MIN_SPEED:g} to 1")
 
 
 def check_pose_offset(value: object, name: str) -> None:
@@ -82,7 +92,7 @@ def check_lens(lens: object, centre: object) -> None:
 
     `centre` may be None, except for a radial lens: with a wrong centre, the fit succeeds, but its positions are wrong.
     """
-    if lens not in LENSES:
+    if not isinstance(lens, str) or lens not in LENSES:
         _refuse(lens, "lens", f"one of {', '.join(LENSES)}")
     if centre is None:
         if lens == "radial":
@@ -113,4 +123,4 @@ def _parse_number(value: object) -> float | None:
 
 
 def _refuse(value: object, name: str, expected: str) -> NoReturn:
-    raise RefusedError(RefusalCode.MALFORMED, f"{name} is {value!r:.100}: expected {expected}")
+    raise RefusedError(RefusalCode.MALFORMED, f"{name} is {quoted(repr(value))}: expected {expected}")

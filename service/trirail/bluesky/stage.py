@@ -20,7 +20,7 @@ from trirail.bluesky.monitor import Monitored, Readings
 from trirail.bluesky.mover import Mover, setpoint_of, stop_elsewhere
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
-from trirail.client.trajectory import Points, points_of
+from trirail.client.trajectory import Points, first_pose, points_of
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.goals import PoseGoal
 from trirail.wire.marks import MarkLike, marks_of
@@ -158,7 +158,8 @@ class Stage(Monitored, AsyncReadable, HasHints):
         stream cannot contain both.
         """
         rows, places = points_of(points), marks_of(marks)
-        first = dict(enumerate((rows[0].x, rows[0].y, rows[0].phi)))
+        start = first_pose(rows)("")
+        first = dict(enumerate((start.x, start.y, start.phi)))
         return Flight(self, lambda robot: robot.follow(rows, stretch=stretch, marks=places), bool(places), name, first)
 
     def fly_to(

@@ -21,7 +21,7 @@ from msgspec import structs
 from trirail_drivers.interface import Triple
 
 from trirail.alignment.alignment_request import AlignmentRequest, LookReport, Observation, StageMotion
-from trirail.alignment.arguments import check_wait
+from trirail.alignment.arguments import check_speed, check_wait
 from trirail.alignment.camera_calibration import Marks
 from trirail.alignment.results import Measurement
 from trirail.client.call_time import called, called_at
@@ -132,6 +132,7 @@ async def drive_async(
         If `look` raises it.
 
     """
+    check_speed(speed)
     check_wait(wait)
     began = called_at()
     sight = EMPTY_OBSERVATION

@@ -63,7 +63,7 @@ def command_named(name: str) -> Command:
     try:
         return Command(name)
     except ValueError as error:
-        problem = f"unknown command {quoted(name)}: use one of {', '.join(Command)}"
+        problem = f"unknown command {quoted(str(name))}: use one of {', '.join(Command)}"
         raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
 
 

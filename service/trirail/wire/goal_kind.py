@@ -69,9 +69,11 @@ ValidFor = Annotated[
     Annotated[float, Meta(ge=1e-3, le=86_400.0)] | None,
     Meta(description="longest time from arrival to start [s]; afterwards the goal expires"),
 ]
+MIN_SPEED = 1e-3
+"""Smallest fraction of full speed that a goal may have."""
 Speed = Annotated[
     float,
-    Meta(ge=1e-3, le=1.0, description="share of full speed"),
+    Meta(ge=MIN_SPEED, le=1.0, description="share of full speed"),
 ]
 GoalLimits = Annotated[
     OwnLimits | None,
