@@ -31,6 +31,7 @@ from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import Scene
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE
+from trirail_drivers.interface import PowerState
 
 WALL_NS = 1_795_245_300_000_000_000
 BATCH = 50
@@ -53,7 +54,7 @@ def written(path: Path, sent: NDArray[np.void], events: tuple[Event, ...] = (), 
 def test_records_are_equal_bit_for_bit(tmp_path: Path) -> None:
     sent = made.records(1.234)
     sent["commanded_velocity"][7] = np.nan, -0.0, np.inf
-    sent["drive_state"][9] = 1, 2, 255
+    sent["drive_state"][9] = 1, 2, len(PowerState) - 1
     sent["overruns"][11] = 2**62 + 1
     written(tmp_path / "a.rrd", sent)
     recording = read(tmp_path / "a.rrd")
@@ -351,6 +352,20 @@ def test_records_of_another_version_are_refused_by_field(tmp_path: Path, layout:
     stream.send_chunks(chunks(Timelines(1000, 0).for_records(other), [Column(RECORD, FIELDS, structs(other))]))
     stream.disconnect()
     with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its records differ in {differs}$"):
+        read(path)
+
+
+@pytest.mark.parametrize("row", [0, 5, 9])
+@pytest.mark.parametrize(("field", "value"), [("cycle", 1 << 40), ("cycle", -1), ("mode", 255), ("drive_state", 64)])
+def test_records_with_flipped_bits_are_refused_as_damaged(tmp_path: Path, field: str, value: int, row: int) -> None:
+    path, sent = tmp_path / "a.rrd", made.records(0.01)
+    timeline = Timelines(1000, 0).for_records(sent)
+    sent[field][row] = value
+    stream = rr.RecordingStream("trirail")
+    stream.save(path)
+    stream.send_chunks(chunks(timeline, [Column(RECORD, FIELDS, structs(sent))]))
+    stream.disconnect()
+    with pytest.raises(ServiceError, match=r"a\.rrd: damaged: its records have unknown states, or cycle numbers that"):
         read(path)
 
 

@@ -40,7 +40,7 @@ from trirail.telemetry.retention import MAGIC
 from trirail.wire.decoding import INVALID, decoded, prepare
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
-from trirail.wire.records import DTYPE
+from trirail.wire.records import DTYPE, are_known
 
 # Structure of an RRD file: Rerun's crate re_log_encoding, src/rrd/frames.rs.
 _FILE_HEADER = 12
@@ -64,6 +64,8 @@ T = TypeVar("T", bound=msgspec.Struct)
 prepare(Event)
 BY_CYCLE = "cycle"
 """Field by which records are sorted."""
+CONTRADICTION_S = 1e-6
+"""Difference between the time of a record and the time of its cycle above which the record is damaged [s]."""
 _LAYOUT = layout(DTYPE)
 """Arrow types of the fields of a record in a file."""
 
@@ -333,9 +335,14 @@ def _cycles(
         end += len(part)
         _place(part, records[end - len(part) : end])
     t, wall = _times(batches)
-    if np.all(records["cycle"][1:] >= records["cycle"][:-1]):
+    cycle = records["cycle"]
+    # A flipped bit passes Rerun's decoder. The time of a record is its cycle number times the period.
+    apart = np.abs(t * float(cycle[-1]) - cycle * t[-1]) > CONTRADICTION_S * abs(float(cycle[-1]))
+    if cycle.min() < 0 or apart.any() or not are_known(records):
+        raise ServiceError(f"{path}: damaged: its records have unknown states, or cycle numbers that contradict times")
+    if np.all(cycle[1:] >= cycle[:-1]):
         return records, t, wall
-    order = np.argsort(records["cycle"], kind="stable")
+    order = np.argsort(cycle, kind="stable")
     return records[order], t[order], wall[order]
 
 

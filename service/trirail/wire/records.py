@@ -97,6 +97,11 @@ def slider_positions(records: NDArray[np.void] | np.void) -> NDArray[np.float64]
     return positions
 
 
+def are_known(records: NDArray[np.void]) -> bool:
+    """Return True if the records contain only known modes and drive states."""
+    return bool(np.all(records["mode"] < len(MODES)) and np.all(records["drive_state"] < len(PowerState)))
+
+
 def checked(payload: bytes) -> bytes:
     """Check a batch of records; return the batch.
 
@@ -108,7 +113,6 @@ def checked(payload: bytes) -> bytes:
             RefusalCode.MALFORMED, f"records: {len(payload)} bytes are not a multiple of {SIZE}, the size of a record"
         )
     rows = unpack(payload)
-    known = np.all(rows["mode"] < len(MODES)) and np.all(rows["drive_state"] < len(PowerState))
-    if not known or rows["cycle"][0] < 0 or np.any(np.diff(rows["cycle"]) != 1):
+    if not are_known(rows) or rows["cycle"][0] < 0 or np.any(np.diff(rows["cycle"]) != 1):
         raise RefusedError(RefusalCode.MALFORMED, "records: unknown modes or drive states, or cycles out of order")
     return payload
