@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from trirail.client.outgoing import too_many
 from trirail.client.trajectory import points_of, read
-from trirail.errors import TrirailError
+from trirail.errors import RefusedError, TrirailError
 from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 from trirail.wire.sizes import MAX_POINTS
 
@@ -74,6 +76,43 @@ def test_a_trajectory_of_fewer_than_two_points_is_told_by_its_file(rows: int) ->
 def test_columns_are_those_that_there_are_each_once_and_by_threes(head: str) -> None:
     with pytest.raises(TrirailError, match=r"line 1: columns .*; expected t, x, y, phi, and if known vx, vy, w and"):
         read_text(head + "\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("path.csv", "t,x,y,phi\n" + "9" * 200_000, "not CSV: field larger than field limit"),
+        ("path.csv", "t;x;y;phi\n0;0;0;0", "expected t, x, y, phi, .*; separate columns with commas"),
+        ("path.json", "[" * 100_000, "Expected object, got array"),
+        ("path.json", '[{"t": ' + "[" * 100_000, "Expected float, got array"),
+        ("path.json", '[{"z": ' + "[" * 100_000, "Object contains unknown field z"),
+        ("path.json", '[{"t": 1' + "0" * 5000 + "}]", "Number out of range"),
+        ("path.json", "t,x,y,phi", "JSON is malformed"),
+    ],
+)
+def test_what_a_file_has_instead_of_points_is_told_in_one_line(name: str, text: str, said: str) -> None:
+    with pytest.raises(TrirailError, match=rf"\A\S*{name}: .*\Z") as refused:
+        read_text(text, name)
+    assert re.search(said, str(refused.value))
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (3, "points: 3 has no accepted format"),
+        (None, "points: None has no accepted format"),
+        ([3], r"points: \[3\] has no accepted format"),
+        ([()], r"points: row 0 is \(\); expected"),
+        (["0123"], "points: row 0 is '0123'; expected"),
+        ([(0, 0, 0)], "points: row 0 is 3 values; expected"),
+        ([(0, 0, 0, 0), (1, 0, math.nan, 0)], "points: y of row 1 is nan: expected a finite number"),
+        ([(0, 0, 0, "0")], "points: phi of row 0 is '0': expected a finite number"),
+        ([(10**400, 0, 0, 0)], "points: t of row 0 is 1000.*: expected a finite number"),
+    ],
+)
+def test_what_a_program_gives_instead_of_points_is_told(points: Any, said: str) -> None:
+    with pytest.raises(RefusedError, match=f"^{said}"):
+        points_of(points)
 
 
 @pytest.mark.parametrize("number", [5001, 12_000])

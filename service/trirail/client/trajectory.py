@@ -110,8 +110,6 @@ def _points(path: Path, text: str) -> list[TrajectoryPoint]:
     if path.suffix == ".json":
         try:
             return decoded(text, list[TrajectoryPoint])
-        except RecursionError as error:
-            raise TrirailError(f"{path}: nested too deeply; expected a list of points") from error
         except (msgspec.MsgspecError, ValueError) as error:
             raise TrirailError(f"{path}: {quoted(str(error).replace('`', ''))}") from error
     try:
@@ -140,16 +138,13 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
         if not row:
             continue
         values = _numbers(f"{path}: line {rows.line_num}", names, row)
-        try:
-            points.append(
-                TrajectoryPoint(
-                    **{name: values[name] for name in COLUMNS},
-                    velocity=_triple(values, VELOCITY),
-                    acceleration=_triple(values, ACCELERATION),
-                )
+        points.append(
+            TrajectoryPoint(
+                **{name: values[name] for name in COLUMNS},
+                velocity=_triple(values, VELOCITY),
+                acceleration=_triple(values, ACCELERATION),
             )
-        except ValueError as error:
-            raise TrirailError(f"{path}: line {rows.line_num}: {quoted(str(error))}") from error
+        )
     return points
 
 
