@@ -169,3 +169,13 @@ def test_the_last_object_is_whole_if_it_has_as_many_sub_objects_as_it_says(
 def test_a_file_without_objects_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(DriveError, match=r"^drive A: \S+ is not an EDS according to CiA 306: .+"):
         load("A", written(tmp_path, text), NODE)
+
+
+@pytest.mark.parametrize("name", ["maker", "maker.txt", "maker.epf", "maker.EDS"])
+def test_a_file_of_any_name_is_read_by_its_content(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(written(tmp_path, eds(rows(MAKES[0]))).read_bytes())
+    assert content(load("A", path, NODE)[0]) == content(load("A", tmp_path / "maker.eds", NODE)[0])
+    path.write_text("<?xml version='1.0'?>\n<epf/>\n")
+    with pytest.raises(DriveError, match=f"^drive A: {path} is not an EDS according to CiA 306: line 1: "):
+        load("A", path, NODE)

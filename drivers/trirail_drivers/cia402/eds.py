@@ -236,7 +236,7 @@ def _content(file: Path) -> str:
 def _text(file: Path, sections: list[Section]) -> io.StringIO:
     lacks = not any(section.name == "DeviceInfo" for section in sections)  # canopen refuses a file without this section
     text = io.StringIO("".join(map(str, [Section("DeviceInfo", 0, {}), *sections] if lacks else sections)))
-    text.name = str(file)  # canopen recognises an EDS by its file name
+    text.name = f"{file}.eds"  # canopen recognises an EDS by its file name, and manufacturers also use others
     return text
 
 
