@@ -15,7 +15,7 @@ import zenoh
 from rigs import Clock
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.gateway import ROUTES
-from trirail.processes.inbox import MAX_MESSAGES, MAX_MESSAGES_OF_USER, Inbox, _incoming
+from trirail.processes.inbox import MAX_MERGED_STOPS, MAX_MESSAGES, MAX_MESSAGES_OF_USER, Inbox, _incoming
 from trirail.processes.incoming import BURST, RATE, FairQueue, Incoming, Pace
 from trirail.processes.memory_budget import OVERHEAD
 from trirail.wire import zenoh_session
@@ -125,8 +125,10 @@ def test_who_sends_more_than_his_pace_waits_and_nobody_else(inbox: Inbox, clock:
     assert 0.0 < inbox.due() <= 1.0 / RATE
     keep(inbox, "goal")
     assert readable(inbox)
+    assert inbox.due() == 0.0
     assert [incoming.user for incoming in inbox.next_messages(10)] == ["ann"]
     keep(inbox, "cmd", user="eve", name="stop")  # a stop of hers has its own
+    assert inbox.due() == 0.0
     assert [incoming.kind for incoming in inbox.next_messages(10)] == ["cmd"]
     for _ in range(10):
         assert list(inbox.next_messages(10)) == []
@@ -147,6 +149,29 @@ def test_goals_wait_behind_the_stops_of_their_own_user_alone(inbox: Inbox) -> No
     taken = [(incoming.user, incoming.kind) for incoming in inbox.next_messages(BURST + 20)]
     assert taken == [("eve", "cmd")] * BURST + [("ann", "goal")]
     assert inbox.due() > 0.0
+
+
+def test_a_message_of_any_user_that_came_before_a_stop_is_known_until_it_is_read(inbox: Inbox) -> None:
+    keep(inbox, "goal", user="eve")
+    keep(inbox, "cmd", name="stop")
+    keep(inbox, "goal")
+    (stop,) = inbox.next_messages(1)
+    assert inbox.earlier(stop.number)
+    assert [incoming.user for incoming in inbox.next_messages(1)] == ["eve"]
+    assert not inbox.earlier(stop.number)
+
+
+def test_equal_stops_with_another_message_between_them_are_two(inbox: Inbox) -> None:
+    for name in ("stop", "stop", "enable", "stop"):
+        keep(inbox, "cmd", name=name)
+    taken = [(incoming.number, len(incoming.alike)) for incoming in inbox.next_messages(9)]
+    assert taken == [(1, 1), (4, 0), (3, 0)]
+
+
+def test_not_more_equal_stops_are_one_than_may_be(inbox: Inbox) -> None:
+    for _ in range(MAX_MERGED_STOPS + 5):
+        keep(inbox, "cmd", name="stop")
+    assert [1 + len(incoming.alike) for incoming in inbox.next_messages(9)] == [MAX_MERGED_STOPS, 5]
 
 
 def test_what_is_more_than_was_taken_stays_readable(inbox: Inbox) -> None:
@@ -223,20 +248,22 @@ def test_calls_are_read_from_requests_and_from_both_copies_of_a_stop(tmp_path: P
     with zenoh_session.open_service([locator]) as opened, zenoh_session.open_client(locator) as client:
         inbox = Inbox(opened, "demo", KEYS, lambda incoming, error: None)
         inbox.declare()
-        for key, attached in (("goal/ann", str(mark)), ("cmd/ann/stop", name), ("cmd/ann/enable", "else")):
+        sent = (("goal/ann", str(mark)), ("cmd/ann/stop", name), ("cmd/ann/enable", "else"), ("cmd/ann/reset", None))
+        for key, attached in sent:
             client.get(f"trirail/demo/{key}", zenoh.handlers.FifoChannel(1), attachment=attached)
         inbox.stop_at_port(StopRequest("trirail/demo/cmd/ann/quick_stop", name), lambda answer: None)
         marked: dict[str, tuple[str, CallMark | None]] = {}
         wait_until(
             lambda: (
                 marked.update((one.key.split("/", 2)[2], (one.id, one.mark)) for one in inbox.next_messages(9))
-                or len(marked) == 4
+                or len(marked) == 5
             )
         )
     assert marked == {
         "goal/ann": ("", mark),
         "cmd/ann/stop": (name, mark),
         "cmd/ann/enable": ("", None),
+        "cmd/ann/reset": ("", None),
         "cmd/ann/quick_stop": (name, mark),
     }
 
