@@ -141,13 +141,15 @@ def test_who_sends_more_than_his_pace_waits_and_nobody_else(inbox: Inbox, clock:
     assert len(list(inbox.next_messages(10_000))) == BURST
 
 
-def test_goals_wait_behind_the_stops_of_their_own_user_alone(inbox: Inbox) -> None:
+def test_goals_wait_behind_the_earlier_stops_of_their_own_user_alone(inbox: Inbox) -> None:
+    keep(inbox, "goal", b"early", user="eve")
     for number in range(BURST + 10):
         keep(inbox, "cmd", b"%d" % number, "eve", "stop")  # equal ones would be one
+    keep(inbox, "cmd", user="eve", name="enable")
     for user in ("eve", "ann"):
         keep(inbox, "goal", user=user)
     taken = [(incoming.user, incoming.kind) for incoming in inbox.next_messages(BURST + 20)]
-    assert taken == [("eve", "cmd")] * BURST + [("ann", "goal")]
+    assert taken == [("eve", "cmd")] * BURST + [("eve", "goal"), ("ann", "goal"), ("eve", "cmd")]
     assert inbox.due() > 0.0
 
 
@@ -166,6 +168,12 @@ def test_equal_stops_with_another_message_between_them_are_two(inbox: Inbox) -> 
         keep(inbox, "cmd", name=name)
     taken = [(incoming.number, len(incoming.alike)) for incoming in inbox.next_messages(9)]
     assert taken == [(1, 1), (4, 0), (3, 0)]
+
+
+def test_a_stop_whose_content_is_too_large_to_be_kept_is_equal_to_no_other(inbox: Inbox) -> None:
+    for content in (b"", bytes(MAX_MESSAGE + 1), bytes(MAX_MESSAGE + 1), b""):
+        keep(inbox, "cmd", content, name="stop")
+    assert [len(incoming.alike) for incoming in inbox.next_messages(9)] == [0, 0, 0, 0]
 
 
 def test_not_more_equal_stops_are_one_than_may_be(inbox: Inbox) -> None:
