@@ -281,6 +281,33 @@ def test_each_restart_of_a_gateway_waits_longer_than_the_one_before(
     assert all(wait > pause - 0.01 for wait, pause in zip(waited, pauses, strict=True))
 
 
+def test_restarts_of_long_ago_do_not_count(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "RESTART_PAUSES_S", (0.0,))
+    monkeypatch.setattr(supervisor, "RESTART_PERIOD_S", 0.0)
+    run.ends(
+        1,
+        loop_1="ready(); beat_until(lambda: begun('gateway-3')); heartbeats.heart('loop').rest()",
+        gateway_1=DYING,
+        gateway_2="os._exit(1)",
+        gateway_3="ready()",
+    )
+    died = "the gateway has died (exit code 1): the loop stops the robot and holds its position; restarting it"
+    assert run.told[:3] == ["up", died, died]
+
+
+@pytest.mark.parametrize("name", ["planner", "recorder"])
+def test_what_dies_repeatedly_beside_the_loop_is_started_again_and_again(
+    name: str, run: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "RESTART_PAUSES_S", (0.0,))
+    monkeypatch.setattr(supervisor, "RETRY_PAUSE_S", 0.05)
+    children = {f"{name}_1": DYING, f"{name}_2": "os._exit(1)", f"{name}_3": "os._exit(1)", f"{name}_4": "ready()"}
+    loop = f"ready(); beat_until(lambda: begun('{name}-4')); heartbeats.heart('loop').rest()"
+    run.ends(1, loop_1=loop, gateway_1=SERVING, **children)
+    died = f"the {name} has died (exit code 1): {supervisor.CONSEQUENCES[name]}; restarting it"
+    assert run.told[:4] == ["up", died, f"{died} in 0.05 s", f"{died} in 0.05 s"]
+
+
 def test_a_process_for_which_the_supervisor_has_no_descriptor_is_started_later(
     run: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:

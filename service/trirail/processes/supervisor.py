@@ -63,8 +63,10 @@ RESTART_DURING_START = 1.0
 
 It is long enough to notice that the loop has ended, in which case the process is not restarted.
 """
+RESTART_PERIOD_S = 60.0
+"""Time for which a restart counts [s]."""
 RESTART_PAUSES_S = (0.0, 0.1, 0.3, 1.0, 3.0)
-"""Pauses before the restarts of one process within a minute [s].
+"""Pauses before the restarts of one process within RESTART_PERIOD_S [s].
 
 The first restart is immediate, because the robot holds its position until the gateway is back. The pauses become
 longer, so that the restarts are not used up while a short shortage of memory or processes lasts.
@@ -292,7 +294,7 @@ class Supervisor:
                 self._report(f"the simulated drives have died ({child.end_description}): {CONSEQUENCES[name]}", "error")
             return
         now = time.monotonic()
-        restarts[:] = [moment for moment in restarts if now - moment < 60.0] + [now]
+        restarts[:] = [moment for moment in restarts if now - moment < RESTART_PERIOD_S] + [now]
         used_up = len(restarts) > len(RESTART_PAUSES_S)
         wait = RETRY_PAUSE_S if used_up else RESTART_PAUSES_S[len(restarts) - 1]
         if used_up and name == "gateway":
