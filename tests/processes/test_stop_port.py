@@ -8,6 +8,7 @@ import os
 import resource
 import socket
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest.mock import Mock
@@ -19,7 +20,8 @@ from certificates import service_port, tls_config, user
 from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.client.stop_call import Outcome, StopCall, StopOrder, StopPortError
+from trirail.client import stop_call
+from trirail.client.stop_call import Outcome, Outcomes, StopCall, StopOrder, StopPortError
 from trirail.config import Config, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes import stop_port
@@ -118,6 +120,67 @@ def test_a_stop_is_passed_on_with_key_id_and_content_and_answered(plain: Opened,
     (request,) = asked.requests
     assert (request.key, request.content) == (f"trirail/demo/cmd/ann/{name}", '{"odd": 1')
     assert request.id
+
+
+BUSY = RefusedError(RefusalCode.BUSY, "send fewer")
+DENIED = RefusedError(RefusalCode.NOT_ALLOWED, "needs the role viewer")
+SILENT = ServiceError("no robot answers")
+NO_PORT = StopPortError("no stop port answers")
+
+
+@pytest.mark.parametrize(
+    ("came", "result"),
+    [
+        ([DONE], DONE),
+        ([DENIED], DENIED),  # whatever comes of the other copy
+        *(([failure, DONE], DONE) for failure in (BUSY, SILENT, NO_PORT)),
+        *(([failure, DENIED], DENIED) for failure in (BUSY, SILENT, NO_PORT)),
+        *(([*failures], BUSY) for other in (SILENT, NO_PORT) for failures in itertools.permutations((BUSY, other))),
+        *(([*failures], SILENT) for failures in itertools.permutations((SILENT, NO_PORT))),
+    ],
+)
+def test_a_stop_is_confirmed_by_one_copy_and_fails_if_it_is_refused_or_both_copies_fail(
+    came: list[Outcome], result: Outcome
+) -> None:
+    outcomes = Outcomes(2)
+    *failures, last = came
+    for failure in failures:
+        assert outcomes.decide(failure) is None
+    if isinstance(result, CommandReply):
+        assert outcomes.decide(last) is result
+    else:
+        with pytest.raises(type(result)) as raised:
+            outcomes.decide(last)
+        assert raised.value is result
+
+
+@pytest.mark.parametrize("failure", [BUSY, SILENT, NO_PORT])
+def test_the_failure_of_a_stops_only_copy_is_raised(failure: ServiceError | RefusedError) -> None:
+    with pytest.raises(type(failure)):
+        Outcomes(1).decide(failure)
+
+
+def test_a_stop_that_is_cancelled_while_it_connects_is_not_sent(plain: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its other copy has been confirmed, and the robot may move again."""
+    locator, asked = plain
+    connecting, cancelled, connect = threading.Event(), threading.Event(), stop_call._connect
+
+    def connect_slowly(address: StopAddress, within: float) -> socket.socket:
+        connecting.set()
+        assert cancelled.wait(WITHIN)
+        return connect(address, within)
+
+    monkeypatch.setattr(stop_call, "_connect", connect_slowly)
+    came: list[Outcome] = []
+    calling = StopOrder.create("demo", "ann", "stop", b"", WITHIN).at_door(locator, None, came.append)
+    assert calling is not None
+    assert connecting.wait(WITHIN)
+    calling.cancel()
+    cancelled.set()
+    calling.join()
+    assert isinstance(came[0], StopPortError)
+    assert call(locator, "quick_stop") == DONE
+    assert [request.key for request in asked.requests] == ["trirail/demo/cmd/ann/quick_stop"]
 
 
 @pytest.mark.parametrize("name", sorted(set(Command) - STOPS))
