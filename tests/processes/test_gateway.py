@@ -56,9 +56,14 @@ class FakeLink:
 
     def __init__(self) -> None:
         self.sent: list[Request] = []
+        self.full = False
+        """Whether it takes nothing but announcements."""
 
     def send(self, packet: bytes) -> bool:
-        self.sent.append(packets.decode_request(packet[1:]))
+        request = packets.decode_request(packet[1:])
+        if self.full and not isinstance(request, Announcement):
+            return False
+        self.sent.append(request)
         return True
 
 
@@ -252,6 +257,29 @@ def test_what_the_loop_has_at_once_is_bounded_for_all_users_together(rig: Rig) -
     for ticket in range(1, 41):
         rig.accepted(ticket)
     assert sorted(name for name, _ in rig.goals()) == sorted(f"g{number}" for number in range(40))
+
+
+def test_goals_wait_while_the_loop_has_no_room(rig: Rig) -> None:
+    rig.link.full = True
+    for name in ("a0", "a1"):
+        rig.goal(name)
+    assert rig.goals() == []
+    rig.link.full = False
+    for _ in range(2):  # one of each user at a time
+        rig.gateway._requests.send_goals()
+    assert rig.goals() == [("a0", None), ("a1", None)]
+
+
+@pytest.mark.parametrize("name", ["resume", "stop"])
+def test_a_command_for_which_the_loop_has_no_room_is_refused(rig: Rig, name: str) -> None:
+    rig.link.full = True
+    for _ in range(MAX_COMMANDS_OF_USER):
+        rig.command(name)
+    words = "the queue of requests to the loop is full: send the request again"
+    assert rig.refusals() == [refused("ann", words, RefusalCode.BUSY)] * MAX_COMMANDS_OF_USER
+    rig.link.full = False
+    rig.command(name)  # those that were refused are not in progress
+    assert [request.name for request in rig.commands()] == [name]
 
 
 def test_goals_of_one_who_floods_are_refused_and_nobody_elses(rig: Rig) -> None:
