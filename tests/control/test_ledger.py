@@ -13,7 +13,7 @@ from trirail.control.ledger import Ledger
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.event_codes import EventCode, coded
-from trirail.wire.goals import PoseGoal, VelocityGoal
+from trirail.wire.goals import Goal, PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.messages import REMEMBERED_IDS, GoalReply
 from trirail.wire.packets import Accepted, CommandDone, CommandRequest, GoalRequest, Refused
 from trirail.wire.vocabulary import Command
@@ -130,6 +130,38 @@ def test_a_jog_is_renewed_by_velocities_of_its_id_alone() -> None:
     ]
     ledger.end("stopped", coded("stop by ann", EventCode.OTHER))
     assert ended(ledger) == [("j", "stopped", "ann")]
+
+
+TRACK = TrackGoal(x=0.0, y=0.0, phi=0.0, time=0.0)
+
+
+@pytest.mark.parametrize(
+    ("goal", "released", "reason", "code"),
+    [
+        (JOG, False, "at the limit of platform x", RefusalCode.AT_LIMIT),
+        (JOG, True, "not renewed", RefusalCode.JOG_OVER),
+        (TRACK, False, "not renewed", RefusalCode.JOG_OVER),  # its target was beyond the limit, where it waited
+    ],
+)
+def test_a_jog_that_has_not_been_released_ends_at_its_limit(
+    goal: Goal, released: bool, reason: str, code: RefusalCode
+) -> None:
+    ledger = Ledger()
+    ledger.begin(asked("j", goal), AcceptedPlan(GoalReply("", 1.0), "platform x"), 100.0, 50.0)
+    if released:
+        assert ledger.release(50) is None
+        assert ledger.release(51) is not None
+        assert ledger.release(52) is None
+    ledger.end("done", coded("not renewed", EventCode.NOT_RENEWED))
+    assert ledger.notices[-1].message == f"goal j done: {reason}"
+    with refused_as(code):
+        ledger.check_id(asked("j", goal))
+
+
+def test_a_renewal_that_a_newer_one_has_replaced_is_answered() -> None:
+    ledger = Ledger()
+    ledger.pass_over(asked("j", JOG, ticket=5))
+    assert ledger.answers == [Accepted(5, GoalReply("j", None))]
 
 
 OF_ENDED = {RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER}

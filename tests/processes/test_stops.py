@@ -254,6 +254,13 @@ def test_a_goal_that_was_not_read_when_it_alone_was_stopped_does_not_begin(opene
     assert isinstance(played.answers[3][0], CommandReply)
 
 
+def test_a_stop_of_a_goal_that_was_never_sent_is_not_confirmed(opened: zenoh.Session) -> None:
+    played = Played(opened, [Goal("bob"), Read(9), StopSent("ann", "stop", b'{"goal": "bob-2"}', "")])
+    (answer,) = played.answers[2]
+    assert isinstance(answer, ErrorReply)
+    assert answer.code is RefusalCode.NO_GOAL
+
+
 def test_one_that_cannot_be_read_is_carried_out_first_and_refused(opened: zenoh.Session) -> None:
     played = Played(
         opened, [Goal("bob"), *(StopSent("ann", "stop", b"no JSON", "a", at_port) for at_port in (False, True))]

@@ -174,6 +174,17 @@ def test_a_gateway_that_is_started_again_repeats_events_that_are_told_and_counte
     assert Counter(run.health.events.goals) == Counter(done=before + after)
 
 
+def test_a_gateway_knows_whether_it_is_started_again(run: Running) -> None:
+    tell = "(folder / f'{number}.again').write_text(str(child.order.again)); "
+    run.ends(
+        1,
+        loop_1="ready(); beat_until(lambda: begun('gateway-2')); heartbeats.heart('loop').rest()",
+        gateway_1=tell + DYING,
+        gateway_2=tell + "ready()",
+    )
+    assert [(run.folder / f"{number}.again").read_text() for number in (1, 2)] == ["False", "True"]
+
+
 def test_a_gateway_that_hangs_in_its_start_is_killed(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     run.told = Told("up", 6.0, monkeypatch)
     run.ends(
