@@ -410,6 +410,20 @@ def test_a_stop_of_a_goal_that_waits_reaches_the_loop_which_may_have_another_of_
     assert rig.goals()[-1] == ("a", "stop by ann")
 
 
+def test_a_goal_that_the_loop_does_not_have_is_stopped_without_it(rig: Rig) -> None:
+    rig.gateway._states.records(np.zeros(1, DTYPE))
+    *_, last = names = "abcdefgh"[: MAX_GOALS_OF_USER + 1]
+    for name in names:
+        rig.goal(name)
+    answers: list[object] = []
+    stop = came("cmd", "trirail/demo/cmd/ann/stop", b'{"goal": "%b"}' % last.encode())
+    rig.gateway._handle(stop._replace(at_door=answers.append))
+    assert [type(answer) for answer in answers] == [CommandReply]
+    assert rig.commands() == []
+    rig.accepted(1)
+    assert rig.goals()[-1] == (last, "stop by ann")
+
+
 @pytest.mark.parametrize("content", [b"", b'{"goal": "g"}'])
 def test_a_stop_that_overtook_a_part_of_a_trajectory_withdraws_the_whole(rig: Rig, content: bytes) -> None:
     points = tuple(TrajectoryPoint(0.1 * n, 0.0, 0.0, 0.0) for n in range(MAX_PART + 1))
