@@ -259,6 +259,15 @@ def test_what_the_loop_has_at_once_is_bounded_for_all_users_together(rig: Rig) -
     assert sorted(name for name, _ in rig.goals()) == sorted(f"g{number}" for number in range(40))
 
 
+def test_a_stop_of_the_service_itself_withdraws_what_waits(rig: Rig) -> None:
+    for number in range(MAX_GOALS_OF_USER + 1):
+        rig.goal(f"a{number}")
+    assert rig.gateway._requests.stop("demo")
+    assert [(request.name, request.user) for request in rig.commands()] == [(Command.STOP, "demo")]
+    rig.accepted(1)
+    assert rig.goals()[-1] == (f"a{MAX_GOALS_OF_USER}", "stop by demo")
+
+
 def test_goals_wait_while_the_loop_has_no_room(rig: Rig) -> None:
     rig.link.full = True
     for name in ("a0", "a1"):

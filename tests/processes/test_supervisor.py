@@ -185,6 +185,17 @@ def test_a_gateway_knows_whether_it_is_started_again(run: Running) -> None:
     assert [(run.folder / f"{number}.again").read_text() for number in (1, 2)] == ["False", "True"]
 
 
+def test_a_gateway_that_is_started_again_is_not_hung_before_its_first_sign_of_life(run: Running) -> None:
+    run.ends(
+        1,
+        loop_1="ready(); beat_until(lambda: begun('gateway-3') or begun('slow')); heartbeats.heart('loop').rest()",
+        gateway_1=DYING,
+        gateway_2="time.sleep(1.5); (folder / 'slow.begun').touch(); ready()",  # longer than it may be silent later
+        gateway_3="ready()",
+    )
+    assert (run.folder / "slow.begun").exists()
+
+
 def test_a_gateway_that_hangs_in_its_start_is_killed(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     run.told = Told("up", 6.0, monkeypatch)
     run.ends(
