@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from panel.fake_robot import FakeRobot
 from trirail.client import held_jog
+from trirail.client.call_time import called_at
 from trirail.client.held_jog import HeldJog
 from trirail.errors import RefusalCode, RefusedError
 from waiting import WITHIN, wait_until
@@ -28,6 +29,16 @@ class Hand:
 
     def velocities(self) -> list[float]:
         return [goal.x for goal in self.robot.sent]
+
+    def press(self) -> None:
+        """Give one sign, and wait until the jog has taken it."""
+        self.jog.hold(RIGHT)
+        wait_until(lambda: self.jog._sign is None)
+
+    def let_go(self) -> None:
+        """Let go, and wait until the jog knows that, after all earlier signs."""
+        self.jog.release()
+        wait_until(lambda: not self.jog._let_go)
 
     def hold(self, until: Callable[[], bool]) -> None:
         """Give signs, many in a time-out, until something holds."""
@@ -93,16 +104,32 @@ def test_letting_go_while_the_service_is_slow_is_not_forgotten(hand: Hand) -> No
     wait_until(lambda: hand.velocities() == [RIGHT[0], 0.0])
 
 
+def test_a_request_is_as_old_as_its_sign(hand: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stop that is called between the sign and the request comes first."""
+    monkeypatch.setattr(held_jog, "TIMEOUT", 5.0)  # no sign grows old on a busy machine
+    times: list[float] = []
+    send = hand.jog._send_goal
+    monkeypatch.setattr(hand.jog, "_send_goal", lambda *goal: times.append(called_at()) or send(*goal))
+    with hand.robot.hanging("goal"):
+        hand.jog.hold(RIGHT)
+        wait_until(lambda: len(hand.robot.sent) == 1)
+        before = time.monotonic()
+        hand.jog.hold(RIGHT)
+        after = time.monotonic()
+    wait_until(lambda: len(times) == 2)
+    assert before <= times[1] <= after
+
+
 @pytest.mark.parametrize("code", [RefusalCode.NOT_ENABLED, RefusalCode.STOPPING, RefusalCode.AT_LIMIT])
 def test_what_the_robot_has_refused_is_not_asked_again_before_the_hand_lets_go(hand: Hand, code: RefusalCode) -> None:
     hand.robot.refusal = RefusedError(code, "no")
     hand.hold(lambda: hand.ends == ["no"])
     hand.robot.refusal = None
     for _ in range(4):
-        hand.jog.hold(RIGHT)
-    hand.jog.release()
+        hand.press()
+    hand.let_go()
+    assert len(hand.robot.sent) == 1
     hand.hold(lambda: hand.robot.goal is not None)
-    assert len(hand.robot.sent) >= 2
     assert hand.robot.sent[0].id != hand.robot.sent[1].id
     assert hand.ends == ["no"]
 
@@ -114,6 +141,6 @@ def test_a_stop_of_somebody_else_ends_it_until_the_hand_lets_go(hand: Hand) -> N
     assert hand.ends == ["stop of ann"]
     asked = len(hand.robot.sent)
     for _ in range(4):
-        hand.jog.hold(RIGHT)
+        hand.press()
     hand.jog.close()
     assert len(hand.robot.sent) == asked

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
+from unittest.mock import Mock
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.client.alignment import finish
-from trirail.client.goal import AsyncGoalHandle
+from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.client.track import AsyncTrack, Taker
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.goals import Goal, TrackGoal
 from trirail.wire.messages import GoalReply
+from trirail.wire.vocabulary import Command, Stop
 
 POSE = 0.0, 0.0, 0.0
 UPDATES = 12
@@ -81,3 +85,30 @@ def test_an_update_is_sent_as_it_is_said() -> None:
     finish(sent.track.update((0.1, 0.2, 0.3), (1.0, 2.0, 3.0), time=5.0))
     said = TrackGoal(0.1, 0.2, 0.3, velocity=(1.0, 2.0, 3.0), time=5.0, id="target", timeout=0.25)
     assert sent.goals[-1] == said
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_leaving_a_track_stops_it_and_waits_for_its_end(ended: bool) -> None:
+    """Also if it has just ended, and the client does not know that yet."""
+    asked: list[tuple[Command, bytes]] = []
+
+    async def command(name: Command, content: bytes) -> None:
+        asked.append((name, content))
+        asyncio.get_running_loop().call_soon(handle.end, Result("target", "stopped", "stop by ann"))
+        if ended:
+            raise RefusedError(RefusalCode.NO_GOAL, "it has ended")
+
+    handle = AsyncGoalHandle("target", command, no_command, no_command)
+
+    async def begin(_: object, goal_id: str) -> AsyncGoalHandle:
+        assert goal_id == handle.id
+        return handle
+
+    async def follow() -> None:
+        async with AsyncTrack(begin, Mock(), "target", 0.25) as track:
+            await track.update(POSE)
+        assert track.result is not None
+        await track.close()
+
+    asyncio.run(follow())
+    assert asked == [(Command.STOP, msgspec.json.encode(Stop("target")))]
