@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import msgspec
@@ -22,7 +23,7 @@ from trirail.processes.gateway import Gateway
 from trirail.processes.incoming import GOAL_PATIENCE, GOALS, GOALS_OF_ONE, MAX_COMMAND_WAIT, Incoming
 from trirail.processes.monitoring import Meter, ServiceMeasurements
 from trirail.processes.replies import REFUSALS_OF_USER
-from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER, REPLY_TIMEOUT_S
+from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER, REPLY_TIMEOUT_S, Requests
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.call_mark import CallMark, new_connection
@@ -257,6 +258,31 @@ def test_what_the_loop_has_at_once_is_bounded_for_all_users_together(rig: Rig) -
     for ticket in range(1, 41):
         rig.accepted(ticket)
     assert sorted(name for name, _ in rig.goals()) == sorted(f"g{number}" for number in range(40))
+
+
+def test_stops_that_are_read_late_withdraw_what_came_before_them_alone(rig: Rig) -> None:
+    """A stop of a user who sends too many waits, and others overtake it."""
+    for number in range(4, 5 + MAX_GOALS_OF_USER):
+        rig.goal(f"g{number}", number=number)
+    late = f"g{4 + MAX_GOALS_OF_USER}"
+    rig.command("stop", user="bob", number=3)
+    rig.accepted(1)
+    assert rig.goals()[-1] == (late, None)
+    rig.command("stop", number=20)
+    rig.command("stop", user="bob", number=10)
+    rig.goal("between", "eve", number=15)
+    assert rig.goals()[-1] == ("between", "stop by ann")
+
+
+def test_a_restarted_gateway_uses_no_ticket_of_the_one_before(rig: Rig) -> None:
+    """The loop may still answer the requests of that one."""
+    gateway, incoming = rig.gateway, came("cmd", "trirail/demo/cmd/ann/resume", b"")
+    tickets = []
+    for _ in range(2):
+        parts = gateway._guard, gateway._replies, gateway._loop_death, nullcontext
+        requests = Requests(CONFIG, rig.link, *parts)  # type: ignore[arg-type]
+        tickets += [requests.command(incoming, "ann", Command.RESUME, None) for _ in range(3)]
+    assert tickets == sorted(set(tickets))
 
 
 def test_a_stop_of_the_service_itself_withdraws_what_waits(rig: Rig) -> None:

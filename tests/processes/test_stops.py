@@ -20,7 +20,7 @@ from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
 from trirail.processes.inbox import MAX_MERGED_STOPS
 from trirail.processes.incoming import Incoming
-from trirail.processes.replies import COPY_WITHIN_S, MARKED_COPY_WITHIN_S, Copies
+from trirail.processes.replies import COPIES_KEPT, COPY_WITHIN_S, MARKED_COPY_WITHIN_S, Copies
 from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.call_mark import CallMark
@@ -254,6 +254,12 @@ def test_a_goal_that_was_not_read_when_it_alone_was_stopped_does_not_begin(opene
     assert isinstance(played.answers[3][0], CommandReply)
 
 
+def test_a_goal_that_is_sent_after_a_stop_of_its_id_begins(opened: zenoh.Session) -> None:
+    played = Played(opened, [Goal("ann"), StopSent("ann", "stop", b'{"goal": "bob-1"}', ""), Goal("bob")])
+    passed = {each.id: each.withdrawn for each in played.sent if isinstance(each, GoalRequest)}
+    assert passed == {"ann-1": None, "bob-1": None}
+
+
 def test_a_stop_of_a_goal_that_was_never_sent_is_not_confirmed(opened: zenoh.Session) -> None:
     played = Played(opened, [Goal("bob"), Read(9), StopSent("ann", "stop", b'{"goal": "bob-2"}', "")])
     (answer,) = played.answers[2]
@@ -283,6 +289,34 @@ def test_a_copy_of_what_was_refused_is_carried_out_only_if_there_was_no_room(cod
     sent = copies.add(stop("a"))
     assert copies.answered(sent, ErrorReply(code, "no")) is None
     assert copies.first(stop("a", at_port=True)) is (None if code is RefusalCode.BUSY else sent.pair)
+
+
+def test_a_stop_is_no_copy_of_another_command_or_of_other_content() -> None:
+    copies, at_port = Copies(), stop("a", at_port=True)
+    sent = copies.add(stop("a"))
+    for other in (at_port._replace(key="trirail/demo/cmd/ann/quick_stop"), at_port._replace(payload=b'{"goal": "g"}')):
+        assert copies.first(other) is None
+    assert copies.first(at_port) is sent.pair
+
+
+def test_a_refusal_of_an_earlier_stop_with_the_same_id_leaves_the_later_one_its_copy() -> None:
+    copies = Copies()
+    earlier, later = copies.add(stop("a")), copies.add(stop("a"))
+    copies.answered(earlier, ErrorReply(RefusalCode.BUSY, "no"))
+    assert copies.first(stop("a", at_port=True)) is later.pair
+
+
+def test_stops_whose_copy_does_not_come_are_forgotten() -> None:
+    now = 0.0
+    copies = Copies(lambda: now)
+    sent = [copies.add(stop(f"a{number}")) for number in range(COPIES_KEPT + 5)]
+    assert copies.first(stop("a4", at_port=True)) is None
+    assert copies.first(stop("a5", at_port=True)) is sent[5].pair
+    for each in sent:
+        copies.answered(each, CommandReply("stop", "holding", 1))
+    now = COPY_WITHIN_S + 1.0
+    copies.add(stop("b"))
+    assert len(copies._pairs) == 1
 
 
 MARK = CallMark("0" * 12, 1)
