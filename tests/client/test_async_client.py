@@ -21,7 +21,9 @@ from panel.fake_robot import FakeRobot
 from trirail.client import goal as goal_module
 from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import GoalHandle, Jog, Lease, Track
+from trirail.client.call_time import called
 from trirail.client.client import Robot
+from trirail.client.connection import Connection
 from trirail.client.goal import AsyncGoalHandle, AsyncJog, Result
 from trirail.client.lease import AsyncLease
 from trirail.client.track import AsyncTrack
@@ -32,7 +34,7 @@ from trirail.wire.goals import Goal, VelocityGoal
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
 from trirail.wire.state import GoalState, State
 from trirail.wire.stop_protocol import StopRequest, stop_address
-from trirail.wire.vocabulary import Stop
+from trirail.wire.vocabulary import Command, Stop
 from waiting import WITHIN
 
 
@@ -158,6 +160,42 @@ def test_a_hundred_calls_at_once_take_no_thread(silent: Silent, locator: str) ->
         await asyncio.gather(*calls)
 
     run(locator, work)
+
+
+@pytest.mark.parametrize("how", ["resumed", "refused"])
+def test_a_pause_that_is_over_or_was_refused_keeps_no_earlier_call_back(silent: Silent, locator: str, how: str) -> None:
+    async def answered(call: Awaitable[object], answer: msgspec.Struct) -> object:
+        task = asyncio.ensure_future(call)
+        await asyncio.to_thread(silent.answer, answer)
+        return await task
+
+    async def work(robot: AsyncRobot) -> None:
+        began = time.monotonic()
+        if how == "refused":
+            with pytest.raises(RefusedError):
+                await answered(robot.pause(), ErrorReply(RefusalCode.NO_GOAL, "no goal is in progress"))
+        else:
+            await answered(robot.pause(), CommandReply("pause", "holding", 1))
+            with called(began), pytest.raises(RefusedError, match="pause was called later"):
+                await robot.enable()
+            await answered(robot.resume(), CommandReply("resume", "moving", 1))
+        with called(began):
+            await answered(robot.enable(), CommandReply("enable", "holding", 1))
+
+    run(locator, work)
+
+
+def test_the_newest_call_of_a_stop_counts_and_a_pause_is_forgotten_up_to_a_call(silent: Silent, locator: str) -> None:
+    connection = Connection("demo", locator)
+    for at in (5.0, 3.0):
+        connection.note_stop(Command.PAUSE, at)
+    for until in (4.0, 5.0):
+        with pytest.raises(RefusedError, match="pause was called later"):
+            connection.check_stops(4.0)
+        connection.check_stops(6.0)
+        connection.forget_pause(until)
+    connection.check_stops(4.0)
+    connection.close()
 
 
 CALLS: dict[str, Callable[[AsyncRobot], Awaitable[object]]] = {
@@ -530,7 +568,14 @@ def test_another_event_loop_is_told_to_enter_a_robot_of_its_own(silent: Silent, 
 
 
 @pytest.mark.parametrize("failed", [2, 3])
-@pytest.mark.parametrize("error", [ServiceError("no robot answers"), RefusedError(RefusalCode.BUSY, "too many")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        ServiceError("no robot answers"),
+        RefusedError(RefusalCode.BUSY, "too many"),
+        RefusedError(RefusalCode.AT_LIMIT, "the jog has ended at a limit"),
+    ],
+)
 def test_a_jog_brakes_at_its_end_although_a_renewal_has_failed(error: TrirailError, failed: int) -> None:
     """A jog may last for up to ten seconds without a renewal."""
     sent: list[float] = []
@@ -543,8 +588,14 @@ def test_a_jog_brakes_at_its_end_although_a_renewal_has_failed(error: TrirailErr
             raise error
         return handle
 
+    regular = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
+
+    async def wait(_timeout: float) -> None:
+        if not regular:
+            raise ServiceError("the end of goal g is unknown")
+
     handle = AsyncGoalHandle("g", nothing, nothing, nothing)
-    vars(handle).update(wait=nothing)
+    vars(handle).update(wait=wait)
 
     async def main() -> AsyncJog:
         async with AsyncJog(send, (0.05, 0.0, 0.0), 0.3) as jog:
@@ -552,5 +603,5 @@ def test_a_jog_brakes_at_its_end_although_a_renewal_has_failed(error: TrirailErr
                 await asyncio.sleep(0.01)
         return jog
 
-    assert asyncio.run(main()).error is error
+    assert asyncio.run(main()).error is (None if regular else error)
     assert sent == [*[0.05] * failed, 0.0]

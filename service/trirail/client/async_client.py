@@ -628,7 +628,7 @@ class AsyncRobot:
         """Send a command that stops the robot. Requests that were called for earlier are not sent afterwards."""
         called_for = called_at()
         if stops_everything(command, payload):
-            self._connection.note_stop(command)
+            self._connection.note_stop(command, called_for)
         if command is Command.PAUSE:
             try:
                 return await self._connection.fetch(("cmd", self.user, command), CommandReply, payload)

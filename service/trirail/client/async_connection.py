@@ -121,9 +121,9 @@ class AsyncConnection:
                 raise await self.nobody("cmd", user, name) from error
         return reply
 
-    def note_stop(self, name: Command) -> None:
-        """Store the time of the present call, which stops the robot."""
-        self._connection.note_stop(name)
+    def note_stop(self, name: Command, at: float) -> None:
+        """Store the time `at` of a call that stops the robot [s]."""
+        self._connection.note_stop(name, at)
 
     def forget_pause(self, until: float) -> None:
         """Forget a pause that was called at the time `until` [s] or earlier, because it was refused or taken back."""

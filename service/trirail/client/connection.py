@@ -187,9 +187,9 @@ class Connection:
             if at_door is not None:
                 at_door.cancel()
 
-    def note_stop(self, name: Command) -> None:
-        """Store the time of the present call, which stops the robot."""
-        self._stopped_at[name] = max(self._stopped_at[name], called_at())
+    def note_stop(self, name: Command, at: float) -> None:
+        """Store the time `at` of a call that stops the robot [s]."""
+        self._stopped_at[name] = max(self._stopped_at[name], at)
 
     def forget_pause(self, until: float) -> None:
         """Forget a pause that was called at the time `until` [s] or earlier, because it was refused or taken back."""
@@ -293,7 +293,7 @@ class Connection:
             return session.declare_subscriber(self.key("state"), self._reader.messages(State, deliver))
 
     def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
-        """Pass every event to `deliver` until the subscriber's context ends; with `history`, begin with the past events.
+        """Pass every event to `deliver` until the subscriber's context ends; with `history`, begin with past events.
 
         Without `history`, the events that occur while the gateway restarts are missing.
         """
