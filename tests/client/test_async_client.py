@@ -162,7 +162,7 @@ def test_a_hundred_calls_at_once_take_no_thread(silent: Silent, locator: str) ->
     run(locator, work)
 
 
-@pytest.mark.parametrize("how", ["resumed", "refused"])
+@pytest.mark.parametrize("how", ["resumed", "refused", "stop of one goal"])
 def test_a_pause_that_is_over_or_was_refused_keeps_no_earlier_call_back(silent: Silent, locator: str, how: str) -> None:
     async def answered(call: Awaitable[object], answer: msgspec.Struct) -> object:
         task = asyncio.ensure_future(call)
@@ -174,6 +174,8 @@ def test_a_pause_that_is_over_or_was_refused_keeps_no_earlier_call_back(silent: 
         if how == "refused":
             with pytest.raises(RefusedError):
                 await answered(robot.pause(), ErrorReply(RefusalCode.NO_GOAL, "no goal is in progress"))
+        elif how == "stop of one goal":
+            await answered(robot.command("stop", Stop("g")), CommandReply("stop", "holding", 1))
         else:
             await answered(robot.pause(), CommandReply("pause", "holding", 1))
             with called(began), pytest.raises(RefusedError, match="pause was called later"):
@@ -196,6 +198,24 @@ def test_the_newest_call_of_a_stop_counts_and_a_pause_is_forgotten_up_to_a_call(
         connection.forget_pause(until)
     connection.check_stops(4.0)
     connection.close()
+
+
+def test_events_that_are_repeated_are_not_missed_and_end_no_goal() -> None:
+    robot = AsyncRobot("demo")
+
+    def hear(seq: int, run: str) -> None:
+        robot._on_event(Event("mode", "info", "holding", seq=seq, t=0.0, cycle=seq, time=0.0, run=run))
+
+    hear(9, "r1")
+    hear(5, "r2")
+    goal = robot._goals.open(AsyncGoalHandle("g", nothing, nothing, nothing))
+    robot._goals.accept(goal, GoalReply("g", 1.0, run="r2"))
+    for seq, run in ((3, "r2"), (10, "r1"), (6, "r2")):
+        hear(seq, run)
+    assert not goal._missed
+    assert not goal._ended.is_set()
+    hear(8, "r2")
+    assert goal._missed == "events 7 to 7"
 
 
 CALLS: dict[str, Callable[[AsyncRobot], Awaitable[object]]] = {

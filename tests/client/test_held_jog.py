@@ -8,9 +8,11 @@ from collections.abc import Callable, Iterator
 import pytest
 from panel.fake_robot import FakeRobot
 from trirail.client import held_jog
+from trirail.client.blocking import GoalHandle
 from trirail.client.call_time import called_at
 from trirail.client.held_jog import HeldJog
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.goals import Goal
 from waiting import WITHIN, wait_until
 
 RIGHT = (0.01, 0.0, 0.0)
@@ -108,8 +110,12 @@ def test_a_request_is_as_old_as_its_sign(hand: Hand, monkeypatch: pytest.MonkeyP
     """A stop that is called between the sign and the request comes first."""
     monkeypatch.setattr(held_jog, "TIMEOUT", 5.0)  # no sign grows old on a busy machine
     times: list[float] = []
-    send = hand.jog._send_goal
-    monkeypatch.setattr(hand.jog, "_send_goal", lambda *goal: times.append(called_at()) or send(*goal))
+
+    def send(make: Callable[[str], Goal], goal_id: str) -> GoalHandle:
+        times.append(called_at())
+        return hand.robot.send(make, goal_id)
+
+    monkeypatch.setattr(hand.jog, "_send_goal", send)
     with hand.robot.hanging("goal"):
         hand.jog.hold(RIGHT)
         wait_until(lambda: len(hand.robot.sent) == 1)

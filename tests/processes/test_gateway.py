@@ -447,7 +447,7 @@ def test_a_stop_of_a_goal_that_waits_reaches_the_loop_which_may_have_another_of_
 
 def test_a_goal_that_the_loop_does_not_have_is_stopped_without_it(rig: Rig) -> None:
     rig.gateway._states.records(np.zeros(1, DTYPE))
-    *_, last = names = "abcdefgh"[: MAX_GOALS_OF_USER + 1]
+    *_, last = names = [*"abcdefgh"[: MAX_GOALS_OF_USER + 1]]
     for name in names:
         rig.goal(name)
     answers: list[object] = []
