@@ -104,8 +104,10 @@ class Cia402Axis(Axis):
         """Whether the statusword must be requested by SDO: the last heartbeat showed a state without PDOs, or a
         controlword has been sent by SDO.
         """
-        self.left_operational = False
-        """Whether the drive has left NMT operational, and its set-up has not been checked since then."""
+        self.left_operational, self.left_at = False, 0
+        """Whether the drive has left NMT operational, and its set-up has not been checked since then; and the number of
+        the SYNC after which it last left without a boot.
+        """
         self.sdo_asked: bytes | None = None
         """Index of the object whose SDO answer is pending, little-endian."""
         self._pending = PendingRequest()
@@ -469,7 +471,7 @@ class Cia402Axis(Axis):
         it no longer follows setpoints, but neither has it reported that it is without power.
         """
         self._operational = False
-        self.left_operational = True
+        self.left_operational, self.left_at = True, self.syncs
         self.outputs_sent = NOTHING_SENT  # the drive may have missed the last ones
         if self.state is PowerState.OPERATION_ENABLED:
             self.state = PowerState.SWITCHED_ON

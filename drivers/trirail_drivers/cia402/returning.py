@@ -20,7 +20,8 @@ from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Clock
 
 SETTLED_AFTER: Final = 2 * ANSWERS_AFTER
-"""Number of SYNCs after a boot-up message. Within this time, another node with the same id shows itself by answers."""
+"""Number of SYNCs after a boot-up message, or a heartbeat in a state without PDOs. Within this time, another node with
+the same id shows itself by answers."""
 _NUMBERS: Final = {"vendor": "vendor", "product": "product code", "revision": "revision", "serial": "serial number"}
 """Fields of an Identity, and their names in CiA 301 (1018h)."""
 _MAY_DIFFER: Final = ("revision", "serial")
@@ -98,8 +99,10 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
 
     @property
     def settled(self) -> bool:
-        """Whether enough SYNCs have passed since the boot for another node with the same id to show itself."""
-        return self.axis.syncs >= self.booted_at + SETTLED_AFTER
+        """Whether another node with the same id has had time to show itself, since the drive booted or left NMT
+        operational.
+        """
+        return self.axis.syncs >= max(self.booted_at, self.axis.left_at) + SETTLED_AFTER
 
     def has_answered(self, now: float) -> bool:
         """Whether the cycle's last SDO request has been answered or has timed out.

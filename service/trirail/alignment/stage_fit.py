@@ -3,11 +3,11 @@
 The noise is estimated from the median of the residuals. A first fit with a robust loss function (soft l1; Triggs et al.
 2000, Bundle Adjustment, 4.3) finds the outliers. Least-squares fits without the outliers follow until the noise no
 longer falls: first of all combinations, then of those that the looks determine. With a noise that is still too high,
-some of these would appear undetermined. In all fits, the drawings are treated as an additional observation of each correction, with the standard deviations
-StageModel.doubts. If the corrections are greater on average, these standard deviations are increased to their root mean
-square: a stage that was homed 1 mm off would otherwise be held back, and would look as if no geometry explained it.
-In the same way, the middle of the picture is an additional observation of the centre of a radial lens, which looks do
-not determine if the lens has no distortion.
+some of these would appear undetermined. In all fits, the drawings are treated as an additional observation of each
+correction, with the standard deviations StageModel.doubts. If the corrections are greater on average, these standard
+deviations are increased to their root mean square: a stage that was homed 1 mm off would otherwise be held back, and
+would look as if no geometry explained it. In the same way, the middle of the picture is an additional observation of
+the centre of a radial lens, which looks do not determine if the lens has no distortion.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def _with_configured_combinations(model: StageModel, unknowns: Floats, basis: Fl
     rows = jacobian.reshape(-1, model.size)
     scales = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)[model.legs :]
     others = np.linalg.lstsq(rows[:, model.legs :] / scales, -rows[:, : model.legs] @ change, rcond=None)[0] / scales
-    return unknowns + np.concatenate([change, others])
+    return np.asarray(unknowns + np.concatenate([change, others]))
 
 
 def _minimise(
