@@ -158,7 +158,7 @@ class Stage(Monitored, AsyncReadable, HasHints):
         stream cannot contain both.
         """
         rows, places = points_of(points), marks_of(marks)
-        start = first_pose(rows)("")
+        start = first_pose(rows)("start")
         first = dict(enumerate((start.x, start.y, start.phi)))
         return Flight(self, lambda robot: robot.follow(rows, stretch=stretch, marks=places), bool(places), name, first)
 
