@@ -267,7 +267,7 @@ def test_a_report_says_which_file_of_the_session_is_left_out(tmp_path: Path) -> 
     recorder.close()
     (tmp_path / f"{recorder.path.stem}-part2.rrd").touch()
     report = str(Recordings("demo", lambda: str(tmp_path)).report(recorder.path.stem))
-    assert f"{recorder.path.stem}-part2.rrd: not a recording" in report
+    assert f"{recorder.path.stem}-part2.rrd: cut off in its header: the recording is empty" in report
     assert "100 at 1000 Hz" in report
 
 
